@@ -1,0 +1,48 @@
+# `make` lists the targets. Settings are given on the command line, not through the environment:
+# what runs is what was typed.
+
+SEED = 0
+TASK = visual_dot_reacher
+STEPS = $(if $(filter dot_reacher,$(TASK)),5000,7000)
+MODE = local_only
+NETWORK =
+RUN_DIR =
+PYTHON =
+
+python = .venv/bin/python
+
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.PHONY: help demo test check format environment lock clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@echo
+	@echo "  make demo [SEED=0] [TASK=visual_dot_reacher] [STEPS=7000] [MODE=local_only] [NETWORK=] [RUN_DIR=]"
+	@echo "  Every target that runs Python makes .venv/ first; PYTHON= chooses its interpreter (3.11 or 3.12)."
+
+demo: environment ## learn a task through all four services, live
+	$(python) -m deploy.launch $(MODE) --task $(TASK) --steps $(STEPS) --seed $(SEED) \
+	  $(if $(NETWORK),--network $(NETWORK)) $(if $(RUN_DIR),--run-dir $(RUN_DIR))
+
+check: environment ## format, lint, types and import rules; edits nothing
+	$(python) -m ruff format --check .
+	$(python) -m ruff check .
+	$(python) -m mypy
+	.venv/bin/lint-imports
+
+test: environment ## run every test
+	$(python) -m pytest
+
+format: environment ## format the code and fix what the linter can
+	$(python) -m ruff check --fix --exit-zero .
+	$(python) -m ruff format .
+
+environment: ## make or renew .venv/ from requirements.lock
+	@PYTHON='$(PYTHON)' deploy/bootstrap/environment.sh sync
+
+lock: ## write requirements.lock anew from pyproject.toml
+	@PYTHON='$(PYTHON)' deploy/bootstrap/environment.sh lock
+
+clean: ## remove the environment and the tools' caches; runs/ stays
+	rm -rf .venv .uv .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
