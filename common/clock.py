@@ -1,0 +1,95 @@
+"""Time: a clock that can be injected, and the keeper of absolute deadlines."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """A monotonic clock and the ways to wait on it."""
+
+    def now_ns(self) -> int:
+        """Monotonic time, nanoseconds."""
+        ...
+
+    def wait_until(self, deadline_ns: int, condition: threading.Condition) -> bool:
+        """Wait on the held ``condition`` until it is notified (True) or the deadline has passed (False)."""
+        ...
+
+
+class SystemClock:
+    """The computer's monotonic clock."""
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns()
+
+    def wait_until(self, deadline_ns: int, condition: threading.Condition) -> bool:
+        remaining_s = (deadline_ns - time.monotonic_ns()) / 1e9
+        return remaining_s > 0 and condition.wait(remaining_s)
+
+
+class FakeClock:
+    """A clock that stands still until it is told; waiting moves it straight to the deadline."""
+
+    def __init__(self, now_ns: int = 1_000_000_000) -> None:
+        self._now_ns = now_ns
+
+    def now_ns(self) -> int:
+        return self._now_ns
+
+    def advance(self, seconds: float) -> None:
+        """Move time on."""
+        self._now_ns += round(seconds * 1e9)
+
+    def advance_to(self, now_ns: int) -> None:
+        """Move time on to ``now_ns``; never back."""
+        self._now_ns = max(self._now_ns, now_ns)
+
+    def wait_until(self, deadline_ns: int, condition: threading.Condition) -> bool:
+        self.advance_to(deadline_ns)
+        return False
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """How one deadline was met."""
+
+    late_ns: int
+    """Time by which it was missed; 0 or less if it was met."""
+    overrun: bool
+    """Missed by more than the tolerated share of the period."""
+    skipped: int
+    """Whole periods that passed unnoticed and were given up."""
+
+
+class CycleKeeper:
+    """Absolute deadlines of a periodic loop: being late once does not shift the deadlines after it.
+
+    If more than a whole period is missed, the keeper gives up those periods instead of hurrying after them.
+    """
+
+    def __init__(self, period_ns: int, tolerance: float = 0.1) -> None:
+        if period_ns <= 0:
+            raise ValueError(f"period_ns: expected more than 0, got {period_ns}")
+        self.period_ns = period_ns
+        self._tolerance_ns = round(period_ns * tolerance)
+        self.deadline_ns = 0
+        """End of the cycle that is running."""
+
+    def start(self, now_ns: int) -> None:
+        """Begin the first cycle now."""
+        self.deadline_ns = now_ns + self.period_ns
+
+    def next(self, now_ns: int) -> Lateness:
+        """End the running cycle, which should be at its deadline, and begin the next one."""
+        late_ns = now_ns - self.deadline_ns
+        skipped = max(0, late_ns) // self.period_ns
+        self.deadline_ns += (1 + skipped) * self.period_ns
+        return Lateness(late_ns, late_ns > self._tolerance_ns, skipped)
+
+    def stretch(self, now_ns: int) -> None:
+        """Let the running cycle last longer: it ended now, later than its deadline, on purpose."""
+        self.deadline_ns = max(self.deadline_ns, now_ns)

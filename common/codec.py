@@ -1,0 +1,192 @@
+"""Messages to bytes and back, by msgpack.
+
+Not pickle: a pickle executes what a peer sends. A payload is one msgpack map: ``schema`` (version), ``message``
+(type name) and the message's fields; an array is ``[dtype, shape, raw little-endian bytes]``. Decoding checks type,
+shape, dtype, finiteness and bounds, so that what a service receives is safe to use as it is. Decoded arrays are
+read-only views of the received bytes: nothing is copied.
+"""
+
+from __future__ import annotations
+
+import math
+import types
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from enum import StrEnum
+from functools import cache
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgpack
+import numpy as np
+
+from common.errors import MessageError, SchemaVersionError
+from common.messages import MESSAGES, SCHEMA_VERSION, Array, Bounds, Dimensions
+
+Message = TypeVar("Message")
+Sizes = dict[str, int]
+Decoder = Callable[[Any, str, Sizes], Any]
+
+_UNBOUNDED = Bounds()
+_BY_NAME = {message.__name__: message for message in MESSAGES}
+
+
+def encode(message: Any) -> bytes:
+    """Return the payload of a message of :data:`common.messages.MESSAGES`."""
+    values = {"schema": SCHEMA_VERSION, "message": type(message).__name__, **_plain_fields(message)}
+    packed = msgpack.packb(values, use_bin_type=True)
+    assert isinstance(packed, bytes)
+    return packed
+
+
+def decode(payload: bytes, expected: type[Message], dimensions: Dimensions | None = None) -> Message:
+    """Return the message in ``payload``.
+
+    Args:
+        payload: bytes made by :func:`encode` of this or another implementation.
+        expected: the type that belongs on the key expression the payload arrived on.
+        dimensions: sizes the arrays must have; None accepts any sizes that agree with each other.
+
+    Raises:
+        SchemaVersionError: the sender speaks another schema version.
+        MessageError: anything else is wrong; the text names the field, what was expected and what came.
+    """
+    name = expected.__name__
+    try:
+        values = msgpack.unpackb(payload, raw=False, strict_map_key=True)
+    except (ValueError, msgpack.UnpackException, RecursionError) as error:
+        raise MessageError(f"{name}: {len(payload)} bytes are not one msgpack value: {error}") from error
+    if not isinstance(values, dict):
+        raise MessageError(f"{name}: expected a msgpack map, got {type(values).__name__}")
+    schema = values.pop("schema", None)
+    if schema != SCHEMA_VERSION:
+        raise SchemaVersionError(
+            f"{name}: expected schema version {SCHEMA_VERSION}, got {schema!r}; run the same release on all computers"
+        )
+    message = values.pop("message", None)
+    if message != name:
+        known = "" if message in _BY_NAME else " (unknown to this release)"
+        raise MessageError(f"expected message {name}, got {message!r}{known}")
+    sizes = {} if dimensions is None else dict(vars(dimensions))
+    decoded: Message = _decode_dataclass(expected, values, name, sizes)
+    return decoded
+
+
+def _plain_fields(message: Any) -> dict[str, Any]:
+    return {f.name: _plain(getattr(message, f.name)) for f in fields(message)}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        contiguous = np.ascontiguousarray(value)
+        return [value.dtype.str, list(value.shape), contiguous.data if contiguous.size else b""]
+    if isinstance(value, StrEnum):
+        return value.value
+    if isinstance(value, np.generic):
+        return value.item()
+    if is_dataclass(value):
+        return _plain_fields(value)
+    return value
+
+
+@cache
+def _decoders(cls: Any) -> tuple[tuple[str, Decoder], ...]:
+    hints = get_type_hints(cls, include_extras=True)
+    return tuple((f.name, _decoder(hints[f.name])) for f in fields(cls))
+
+
+def _decode_dataclass(cls: Any, values: Any, where: str, sizes: Sizes) -> Any:
+    if not isinstance(values, dict):
+        raise MessageError(f"{where}: expected a map, got {type(values).__name__}")
+    decoders = _decoders(cls)
+    if len(values) != len(decoders) or any(name not in values for name, _ in decoders):
+        names = {name for name, _ in decoders}
+        missing, unknown = sorted(names - values.keys()), sorted(map(str, values.keys() - names))
+        raise MessageError(f"{where}: missing fields {missing}, unknown fields {unknown}")
+    return cls(**{name: decoder(values[name], f"{where}.{name}", sizes) for name, decoder in decoders})
+
+
+def _decoder(hint: Any, bounds: Bounds = _UNBOUNDED) -> Decoder:
+    """Return the function that checks and converts one field."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        inner, rule = arguments
+        return _array_decoder(np.dtype(rule.dtype), rule.shape) if isinstance(rule, Array) else _decoder(inner, rule)
+    if origin in (Union, types.UnionType):
+        present = _decoder(next(a for a in arguments if a is not type(None)))
+        return lambda value, where, sizes: None if value is None else present(value, where, sizes)
+    if origin is dict:
+        element = _decoder(arguments[1])
+        return lambda value, where, sizes: {
+            _text(key, where): element(item, f"{where}[{key}]", sizes)
+            for key, item in _instance(value, dict, where).items()
+        }
+    if origin is list:
+        element = _decoder(arguments[0])
+        return lambda value, where, sizes: [element(item, where, sizes) for item in _instance(value, list, where)]
+    if isinstance(hint, type) and is_dataclass(hint):
+        return lambda value, where, sizes: _decode_dataclass(hint, value, where, sizes)
+    if issubclass(hint, StrEnum):
+        return lambda value, where, sizes: _enumeration(hint, value, where)
+    if hint is bool:
+        return lambda value, where, sizes: _instance(value, bool, where)
+    if hint is str:
+        return lambda value, where, sizes: _text(value, where)
+    return lambda value, where, sizes: _number(hint, value, where, bounds)
+
+
+def _instance(value: Any, cls: type, where: str) -> Any:
+    if not isinstance(value, cls):
+        raise MessageError(f"{where}: expected {cls.__name__}, got {type(value).__name__}")
+    return value
+
+
+def _text(value: Any, where: str) -> str:
+    text: str = _instance(value, str, where)
+    return text
+
+
+def _enumeration(cls: type[StrEnum], value: Any, where: str) -> StrEnum:
+    try:
+        return cls(value)
+    except ValueError:
+        raise MessageError(f"{where}: expected one of {[m.value for m in cls]}, got {value!r}") from None
+
+
+def _number(kind: type, value: Any, where: str, bounds: Bounds) -> Any:
+    accepted = (int, float) if kind is float else (int,)
+    if not isinstance(value, accepted) or isinstance(value, bool):
+        raise MessageError(f"{where}: expected {kind.__name__}, got {type(value).__name__}")
+    if not math.isfinite(value):
+        raise MessageError(f"{where}: expected a finite number, got {value}")
+    low, high = bounds.low, bounds.high
+    if (low is not None and value < low) or (high is not None and value > high):
+        raise MessageError(f"{where}: expected a value in [{low}, {high}], got {value}")
+    return kind(value)
+
+
+def _array_decoder(dtype: np.dtype[Any], shape: tuple[str | int, ...]) -> Decoder:
+    def decode_array(value: Any, where: str, sizes: Sizes) -> np.ndarray[Any, Any]:
+        if not (isinstance(value, list) and len(value) == 3):
+            raise MessageError(f"{where}: expected [dtype, shape, bytes], got {type(value).__name__}")
+        sent_dtype, sent_shape, raw = value
+        if sent_dtype != dtype.str:
+            raise MessageError(f"{where}: expected dtype {dtype.str}, got {sent_dtype!r}")
+        valid = isinstance(sent_shape, list) and all(type(n) is int and n >= 0 for n in sent_shape)
+        if not valid or len(sent_shape) != len(shape):
+            raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {sent_shape!r}")
+        for letter, size in zip(shape, sent_shape, strict=True):
+            wanted = letter if isinstance(letter, int) else sizes.setdefault(letter, size)
+            if size != wanted:
+                raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {sent_shape}")
+        if not isinstance(raw, bytes) or len(raw) != math.prod(sent_shape) * dtype.itemsize:
+            raise MessageError(f"{where}: {sent_shape} of {dtype} do not fit the bytes that came")
+        result = np.frombuffer(raw, dtype).reshape(sent_shape)
+        if dtype.kind == "f" and not np.isfinite(result).all():
+            raise MessageError(f"{where}: expected finite numbers, got NaN or infinity")
+        return result
+
+    return decode_array
+
+
+def _described(shape: tuple[str | int, ...], sizes: Sizes) -> str:
+    return "(" + ", ".join(str(s if isinstance(s, int) else sizes.get(s, s)) for s in shape) + ")"

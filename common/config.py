@@ -1,0 +1,175 @@
+"""Configuration: frozen dataclasses, filled from a TOML file and ``--set section.key=value``.
+
+A configuration class is a dataclass of sections; a section is a dataclass of settings declared with
+:func:`setting`. Everything is checked when it is loaded: an unknown key, a wrong type or a value out of range is a
+:class:`~common.errors.ConfigError` that names the key, the value and what was expected.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from common.errors import ConfigError
+
+Config = TypeVar("Config")
+Tables = dict[str, dict[str, Any]]
+
+
+def setting(
+    default: Any = MISSING,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: Iterable[str] = (),
+    rest: bool = False,
+) -> Any:
+    """Declare a setting with inclusive bounds or allowed values; ``rest`` collects a section's other keys."""
+    metadata = {"low": low, "high": high, "choices": tuple(choices), "rest": rest}
+    if rest:
+        return field(default_factory=dict, metadata=metadata)
+    if isinstance(default, list):
+        return field(default_factory=lambda: list(default), metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+def load_config(cls: type[Config], path: Path, overrides: Iterable[str] = ()) -> Config:
+    """Read ``path``, apply ``section.key=value`` overrides, check everything, return the configuration."""
+    tables = read_toml(path)
+    for override in overrides:
+        section, key, value = parse_override(override)
+        if section not in section_names(cls):
+            raise ConfigError(f"--set {override}: no section [{section}]{_hint(section, section_names(cls))}")
+        tables.setdefault(section, {})[key] = value
+    return build_config(cls, tables, str(path))
+
+
+def read_toml(path: Path) -> Tables:
+    """Return the tables of a TOML file."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not a TOML file: {error}") from error
+
+
+def parse_override(override: str) -> tuple[str, str, Any]:
+    """Split ``section.key=value``; the value is TOML (``3``, ``true``, ``"text"``), or a bare word as text."""
+    name, equals, text = override.partition("=")
+    section, dot, key = name.strip().partition(".")
+    if not (equals and dot and section and key):
+        raise ConfigError(f"--set {override!r}: expected section.key=value, for example task.preset=thesis")
+    try:
+        return section, key, tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return section, key, text.strip()
+
+
+def section_names(cls: type) -> list[str]:
+    """Sections of a configuration class, in order."""
+    return [f.name for f in fields(cls)]
+
+
+def build_config(cls: type[Config], tables: Mapping[str, Any], where: str) -> Config:
+    """Check ``tables`` against the configuration class and return it."""
+    hints = get_type_hints(cls)
+    for name in tables:
+        if name not in hints:
+            raise ConfigError(f"{where}: unknown section [{name}]{_hint(name, list(hints))}")
+    sections = {
+        name: build_section(section, tables.get(name, {}), f"{where}: [{name}]") for name, section in hints.items()
+    }
+    return cls(**sections)
+
+
+def to_tables(config: Any) -> Tables:
+    """Return a configuration as TOML tables, the opposite of :func:`build_config`."""
+    tables: Tables = {}
+    for section in fields(config):
+        values = getattr(config, section.name)
+        table: dict[str, Any] = {}
+        for item in fields(values):
+            value = getattr(values, item.name)
+            if item.metadata.get("rest"):
+                table.update(value)
+            else:
+                table[item.name] = value
+        tables[section.name] = table
+    return tables
+
+
+def build_section(cls: type[Config], values: Any, where: str) -> Config:
+    """Check one table against its section's class and return the section."""
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{where}: expected a table, got {values!r}")
+    assert is_dataclass(cls)
+    hints = get_type_hints(cls)
+    declared = {f.name: f for f in fields(cls)}
+    rest = next((f.name for f in fields(cls) if f.metadata.get("rest")), None)
+    arguments: dict[str, Any] = {rest: {}} if rest else {}
+    for key, value in values.items():
+        if key in declared and key != rest:
+            arguments[key] = _checked(hints[key], value, declared[key], f"{where} {key}")
+        elif rest:
+            arguments[rest][key] = value
+        else:
+            raise ConfigError(f"{where}: unknown key {key!r}{_hint(key, list(declared))}")
+    for name, item in declared.items():
+        required = item.default is MISSING and item.default_factory is MISSING
+        if required and name not in arguments:
+            raise ConfigError(f"{where}: {name} is missing; expected {_type_name(hints[name])}")
+    try:
+        return cls(**arguments)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
+
+
+def _checked(hint: Any, value: Any, item: dataclasses.Field[Any], where: str) -> Any:
+    kind = get_origin(hint) or hint
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    wrong_bool = isinstance(value, bool) and kind is not bool
+    if not isinstance(value, kind) or wrong_bool:
+        raise ConfigError(f"{where} = {value!r}: expected {_type_name(hint)}")
+    if kind is list:
+        element = get_args(hint)[0]
+        if not all(isinstance(v, element) for v in value):
+            raise ConfigError(f"{where} = {value!r}: expected {_type_name(hint)}")
+        return list(value)
+    metadata = item.metadata
+    if metadata.get("choices") and value not in metadata["choices"]:
+        expected = ", ".join(metadata["choices"])
+        raise ConfigError(f"{where} = {value!r}: expected one of {expected}{_hint(value, metadata['choices'])}")
+    low, high = metadata.get("low"), metadata.get("high")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{where} = {value!r}: expected a finite number")
+    if (low is not None and value < low) or (high is not None and value > high):
+        raise ConfigError(f"{where} = {value!r}: expected {_range(low, high)}")
+    return value
+
+
+def _range(low: float | None, high: float | None) -> str:
+    if high is None:
+        return f"at least {low}"
+    if low is None:
+        return f"at most {high}"
+    return f"a value from {low} to {high}"
+
+
+def _type_name(hint: Any) -> str:
+    return {str: "text", int: "a whole number", float: "a number", bool: "true or false"}.get(
+        hint, str(hint).replace("list[str]", "a list of texts")
+    )
+
+
+def _hint(name: Any, known: Iterable[str]) -> str:
+    known = list(known)
+    close = difflib.get_close_matches(str(name), known, 1)
+    return f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(known)}"

@@ -1,0 +1,278 @@
+"""Replay's end of the ring: creates the file and appends experiences."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import mmap
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from common.errors import MessageError, RingError
+from common.frame_ring import layout
+from common.frame_ring.layout import RANGE_DTYPE, SOURCES, Records, RingLayout
+from common.frame_ring.persisted import PersistedRanges
+from common.frame_ring.reader import read_layout
+from common.frame_ring.view import RingView
+from common.frame_stack import FrameStack, Stack
+from common.messages import Experience, TaskSpec
+
+FRAME_MEMORY = 256
+"""Frames remembered for building stacks: how late an experience may come and still get a whole stack."""
+
+LARGEST_REAL = float(np.finfo(np.float32).max)
+
+
+@dataclass(frozen=True)
+class _StoredStep:
+    """A row's identity, for :class:`FrameStack`."""
+
+    incarnation: int
+    seq: int
+    attempt: int
+    step_index: int
+
+
+class RingWriter(RingView):
+    """The only writer of a ring; construct with :meth:`create_or_reopen`.
+
+    A process killed inside :meth:`append` leaves a ring that reopens without the unfinished row. (A computer that
+    loses power may leave rows appended since the last :meth:`flush` in any condition.)
+    """
+
+    def __init__(self, sizes: RingLayout, mapped: mmap.mmap, file_descriptor: int) -> None:
+        """Go on writing a mapped ring; takes over the file descriptor, whose lock it keeps until closed."""
+        super().__init__(sizes, mapped)
+        self._file_descriptor = file_descriptor
+        table: Records = np.frombuffer(mapped, RANGE_DTYPE, count=layout.PERSISTED_RANGES, offset=sizes.ranges_offset)
+        self._persisted = PersistedRanges(table)
+        self._scratch: Records = np.zeros(1, sizes.row_dtype)
+        self._stack = FrameStack[int](sizes.frame_stack, FRAME_MEMORY) if sizes.frame_stack else None
+        # A frame whose writing was cut off has spoilt its slot: its number is skipped, never used again.
+        self._counters[layout.FRAMES_DONE] = self._counters[layout.FRAMES_BEGUN]
+        self._recount()
+
+    @classmethod
+    def create_or_reopen(
+        cls, path: str | os.PathLike[str], spec: TaskSpec, capacity_rows: int, frames_per_row: float = 1.25
+    ) -> RingWriter:
+        """Open the ring at ``path``, which is created if it is not there.
+
+        Args:
+            path: the ring's file; its directory must exist.
+            spec: task whose experiences it holds.
+            capacity_rows: experiences before the oldest is overwritten.
+            frames_per_row: camera frames reserved for each row.
+
+        Raises:
+            RingError: no room on the disk, a ring of another layout, another writer, or no access.
+        """
+        name = os.fspath(path)
+        wanted = RingLayout.of_task(spec, capacity_rows, frames_per_row)
+        try:
+            if not os.path.exists(name):
+                _create(name, wanted)
+            descriptor = os.open(name, os.O_RDWR | os.O_CLOEXEC)
+        except OSError as error:
+            raise RingError(f"{name}: cannot open the experience ring: {error.strerror}") from error
+        try:
+            _lock(name, descriptor)
+            sizes = read_layout(name, descriptor)
+            if sizes != wanted:
+                raise RingError(
+                    f"{name}: an experience ring of another layout: {sizes.differences(wanted)}; "
+                    "choose another run directory or restore the settings it was made with"
+                )
+            return cls(sizes, mmap.mmap(descriptor, sizes.file_bytes), descriptor)
+        except BaseException:
+            os.close(descriptor)
+            raise
+
+    @property
+    def persisted_count(self) -> int:
+        """Experiences persisted since the ring's creation, overwritten ones included."""
+        return self.rows_appended
+
+    def contains(self, incarnation: int, seq: int) -> bool:
+        """True if the TimeStep ``seq`` of a bridge incarnation was ever appended."""
+        return self._persisted.contains(incarnation, seq)
+
+    def persisted_counts(self) -> dict[int, int]:
+        """Return how many TimeSteps of each bridge incarnation were ever appended."""
+        return self._persisted.counts()
+
+    def persisted_ranges(self, incarnation: int) -> list[tuple[int, int]]:
+        """Return the half-open ranges of ``seq`` appended of a bridge incarnation, ascending."""
+        return self._persisted.ranges(incarnation)
+
+    def last_persisted(self) -> tuple[int, int] | None:
+        """Return (bridge incarnation, seq) of the last appended experience."""
+        if not self.rows_appended:
+            return None
+        last = self._row(self.rows_appended - 1)
+        return int(last["incarnation"]), int(last["seq"])
+
+    def append(self, experience: Experience) -> int:
+        """Store an experience and return its row number.
+
+        Raises:
+            RingError: it is already there; ask :meth:`contains` first.
+            MessageError: its sizes are not the task's, or a number is out of range. Nothing is stored.
+        """
+        step = experience.time_step
+        if self.contains(step.incarnation, step.seq):
+            raise RingError(f"TimeStep {step.seq} of incarnation {step.incarnation} is already in the ring")
+        self._check(experience)
+        self._fill_values(experience)
+        # What is wrong was refused before the stack remembers the frames: those it remembers will be stored.
+        number, first_frame = self.rows_appended, self.frames_appended
+        # Of more than S new frames, only the last S are in any stack.
+        new = min(len(step.frame_ids), self.layout.frame_stack)
+        stack = None
+        if self._stack is not None:
+            ids = step.frame_ids[len(step.frame_ids) - new :]
+            stack = self._stack.add(step, ids, range(first_frame, first_frame + new))
+        self._fill_stack(stack, new)
+
+        counters = self._counters
+        counters[layout.ROWS_BEGUN] = number + 1
+        counters[layout.FRAMES_BEGUN] = first_frame + new
+        for at, frame in enumerate(step.frames[len(step.frames) - new :], start=first_frame):
+            self._frames[at % self.layout.capacity_frames] = frame
+        self._rows[number % self.layout.capacity_rows] = self._scratch[0]
+        counters[layout.FRAMES_DONE] = first_frame + new
+        counters[layout.ROWS_DONE] = number + 1
+        self._persisted.add(step.incarnation, step.seq)
+        return number
+
+    def flush(self) -> None:
+        """Write everything to the disk; may take long."""
+        self._mapped.flush()
+
+    def close(self) -> None:
+        """Flush, unmap and unlock."""
+        self.flush()
+        del self._persisted
+        super().close()
+        os.close(self._file_descriptor)
+
+    def _row(self, number: int) -> np.void:
+        row: np.void = self._rows[number % self.layout.capacity_rows]
+        return row
+
+    def _check(self, experience: Experience) -> None:
+        sizes, step, extras = self.layout, experience.time_step, experience.extras
+        arrays = [
+            ("proprioception", step.proprioception, (sizes.proprioception_size,)),
+            ("action", step.action, (sizes.action_size,)),
+        ]
+        if extras:
+            arrays.append(("chosen_action", extras.chosen_action, (sizes.action_size,)))
+        for name, array, shape in arrays:
+            if array.shape != shape:
+                raise MessageError(f"Experience.{name}: expected shape {shape}, got {array.shape}")
+        if sizes.frame_stack and step.frames.shape != (len(step.frame_ids), *sizes.frame_shape):
+            raise MessageError(
+                f"Experience.frames: expected {len(step.frame_ids)} frames of {sizes.frame_shape}, "
+                f"got shape {step.frames.shape}"
+            )
+
+    def _fill_values(self, experience: Experience) -> None:
+        """Compose the row in scratch memory: what is wrong with it shows before anything is overwritten."""
+        step, extras, row = experience.time_step, experience.extras, self._scratch[0]
+        try:
+            row["incarnation"], row["seq"] = step.incarnation, step.seq
+            row["episode"], row["attempt"], row["step_index"] = step.episode, step.attempt, step.step_index
+            row["actor_incarnation"] = experience.actor_incarnation
+            row["action_applied_ns"], row["published_ns"] = step.action_applied_ns, step.published_ns
+            row["policy_version"] = extras.policy_version if extras else 0
+        except OverflowError as error:
+            raise MessageError(f"TimeStep {step.seq}: a number does not fit 64 bits: {error}") from error
+        reals = {"reward": step.reward, "log_probability": extras.log_probability if extras else 0.0}
+        for name, value in reals.items():
+            if not abs(value) <= LARGEST_REAL:  # nan too
+                raise MessageError(f"TimeStep {step.seq}: {name} {value} is no finite 32-bit number")
+            row[name] = value
+        row["proprioception"], row["action"] = step.proprioception, step.action
+        row["action_source"] = SOURCES.index(step.action_source)
+        row["terminated"], row["truncated"] = step.terminated, step.truncated
+        row["has_extras"] = extras is not None
+        row["chosen_action"] = extras.chosen_action if extras else 0.0
+
+    def _fill_stack(self, stack: Stack[int] | None, new: int) -> None:
+        """Complete the row in scratch memory: its frames, and what it is to the row before."""
+        row, number, frames_end = self._scratch[0], self.rows_appended, self.frames_appended + new
+        before = self._row(number - 1) if number else None
+        bound = before["oldest_frame_bound"] if before is not None else 0
+        oldest = min(stack.frames) if stack else frames_end
+        row["stack"] = stack.frames if stack else -1
+        row["frame_ids"] = stack.frame_ids if stack else -1
+        row["oldest_frame"] = oldest
+        row["oldest_frame_bound"] = max(bound, oldest) if stack else bound
+        row["new_frames"] = new
+        is_there = oldest >= frames_end - self.layout.capacity_frames
+        row["whole"] = self._stack is None or (stack is not None and stack.whole and is_there)
+        row["pair"] = before is not None and self._continues(before, row)
+        row["transitions"] = row["pair"] + (before["transitions"] if before is not None else 0)
+
+    @staticmethod
+    def _continues(before: np.void, row: np.void) -> bool:
+        """True if ``row`` is the experience right after ``before`` in its attempt and both have whole stacks."""
+        return bool(
+            row["whole"]
+            and before["whole"]
+            and row["seq"] == before["seq"] + 1
+            and row["step_index"] == before["step_index"] + 1
+            and all(row[name] == before[name] for name in ("incarnation", "episode", "attempt"))
+            and not (before["terminated"] or before["truncated"])
+        )
+
+    def _recount(self) -> None:
+        """Take up where the last writer was: what is persisted, and the frames of the stack."""
+        end = self.rows_appended
+        if end:  # the last one may have been stored but not yet entered into the table
+            self._persisted.add(int(self._row(end - 1)["incarnation"]), int(self._row(end - 1)["seq"]))
+        if self._stack is None:
+            return
+        first, _ = self.live_rows()
+        for number in range(max(first, end - FRAME_MEMORY), end):
+            row = self._row(number)
+            names = ("incarnation", "seq", "attempt", "step_index")
+            new = int(row["new_frames"])
+            known = self.layout.frame_stack - new
+            step = _StoredStep(**{name: int(row[name]) for name in names})
+            self._stack.add(step, row["frame_ids"][known:], [int(n) for n in row["stack"][known:]])
+
+
+def _create(path: str, sizes: RingLayout) -> None:
+    """Make an empty ring; ``path`` appears only when it is complete."""
+    partial = f"{path}.partial"
+    descriptor = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+    try:
+        # Not a sparse file: a mapped page that finds no room later kills the process without an exception.
+        os.posix_fallocate(descriptor, 0, sizes.file_bytes)
+        os.pwrite(descriptor, sizes.header(), 0)
+        os.fsync(descriptor)
+        os.rename(partial, path)
+    except BaseException as error:
+        os.ftruncate(descriptor, 0)  # gives back what was allocated, or the text below would count it as in use
+        Path(partial).unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
+            room = os.statvfs(os.path.dirname(path) or ".")
+            raise RingError(
+                f"{path}: the experience ring needs {sizes.file_bytes} bytes, {room.f_bavail * room.f_frsize} are free "
+                f"({error.strerror}); make room, choose another run directory, or a smaller replay capacity"
+            ) from error
+        raise
+    finally:
+        os.close(descriptor)
+
+
+def _lock(path: str, descriptor: int) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise RingError(f"{path}: another process writes this experience ring; stop it first") from error

@@ -1,0 +1,344 @@
+"""The numbered stream: newest first, nothing lost.
+
+The sender publishes each message once, at once, and may lose it on the way. It retains what the receiver has not
+acknowledged. The receiver takes messages as they come, hands them on in order, and tells the sender what it misses;
+the sender resends that, paced, below everything else. So the newest message is never queued behind repairs, and a
+short network outage costs freshness only while it lasts.
+
+    sender                                            receiver
+      retain(seq, payload) ; put  ── message ───────▶   accept
+      head() every 0.2 s          ── StreamHead ────▶   note_head        what exists, what can still be resent
+      acknowledge                 ◀─ Acknowledgement    acknowledgement  what is done, what is missing
+      due() ; put on `resent`     ── message ───────▶   accept
+
+:class:`RetainedMessages` and :class:`OrderedReceiver` decide; they hold no thread and no clock.
+:class:`JournalSender` runs the sender's side on a thread of its own.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from common.clock import Clock, SystemClock
+from common.codec import decode, encode
+from common.errors import MessageError
+from common.messages import Acknowledgement, StreamHead
+from common.run_settings import JournalSettings
+from common.topics import Topic
+from common.transport import Transport
+
+HEAD_PERIOD_S = 0.2
+"""How often the sender tells what it holds."""
+RESEND_AFTER_S = 0.5
+"""A message is not sent again before this has passed: it may still be on its way."""
+MAX_RANGES = 64
+"""Missing ranges in one acknowledgement; the rest follow in later ones."""
+
+Item = TypeVar("Item")
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class _Retained:
+    payload: bytes
+    first_sent_ns: int
+    last_sent_ns: int
+
+
+class RetainedMessages:
+    """What the sender of one stream holds until it is acknowledged, bounded in time and memory."""
+
+    def __init__(self, max_age_ns: int, max_bytes: int) -> None:
+        self._messages: OrderedDict[int, _Retained] = OrderedDict()
+        self._max_age_ns, self._max_bytes = max_age_ns, max_bytes
+        self.next_seq = 0
+        """Number the next message will get."""
+        self.retained_bytes = 0
+        self.given_up = 0
+        """Messages dropped unacknowledged, because they were too old or too many."""
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    @property
+    def oldest_seq(self) -> int:
+        """Oldest message that can still be resent."""
+        return next(iter(self._messages), self.next_seq)
+
+    def retain(self, seq: int, payload: bytes, now_ns: int) -> None:
+        """Keep message ``seq``, which is being sent now."""
+        if seq != self.next_seq:
+            raise ValueError(f"seq: expected {self.next_seq}, got {seq}")
+        self._messages[seq] = _Retained(payload, now_ns, now_ns)
+        self.next_seq += 1
+        self.retained_bytes += len(payload)
+        while len(self._messages) > 1 and self._over_limit(now_ns):
+            self._drop_oldest()
+            self.given_up += 1
+
+    def acknowledge(self, next_seq: int) -> None:
+        """Forget all messages before ``next_seq``."""
+        while self._messages and self.oldest_seq < next_seq:
+            self._drop_oldest()
+
+    def due(self, ranges: Iterator[tuple[int, int]], now_ns: int) -> Iterator[bytes]:
+        """Payloads of the missing messages that may be sent again now."""
+        for start, end in ranges:
+            for seq in range(max(start, self.oldest_seq), min(end, self.next_seq)):
+                message = self._messages.get(seq)
+                if message and now_ns - message.last_sent_ns >= RESEND_AFTER_S * 1e9:
+                    message.last_sent_ns = now_ns
+                    yield message.payload
+
+    def _over_limit(self, now_ns: int) -> bool:
+        oldest = next(iter(self._messages.values()))
+        return self.retained_bytes > self._max_bytes or now_ns - oldest.first_sent_ns > self._max_age_ns
+
+    def _drop_oldest(self) -> None:
+        _, message = self._messages.popitem(last=False)
+        self.retained_bytes -= len(message.payload)
+
+
+class OrderedReceiver(Generic[Item]):
+    """Takes a stream's messages as they come and hands them on in order, each once.
+
+    A stream begins where its sender says it can still resend from. What the sender has given up is counted as lost
+    and skipped. A newer incarnation of the sender ends the older one's stream.
+    """
+
+    def __init__(self) -> None:
+        self.stream: int | None = None
+        """Sender incarnation that is being received."""
+        self._waiting: dict[int, Item] = {}
+        self._ready: list[Item] = []
+        self._next_seq: int | None = None
+        self._end_seq = 0
+        self._taken_seq = 0
+        self.lost = 0
+        """Messages known to have existed that will never come."""
+        self.duplicates = 0
+        """Messages that came more than once; the first was taken."""
+        self.stale = 0
+        """Messages of an incarnation that has been followed by a newer one."""
+
+    @property
+    def received_all(self) -> bool:
+        """True if nothing that is known to exist is missing."""
+        return self._next_seq is not None and self._next_seq >= self._end_seq
+
+    def has_all(self, stream: int, count: int) -> bool:
+        """True if ``stream`` is being received and its messages before number ``count`` have all been handed on."""
+        return self.stream == stream and self._taken_seq >= count
+
+    def accept(self, stream: int, seq: int, item: Item) -> bool:
+        """Take one message; False if it was not wanted (known already, or of an old incarnation)."""
+        if not self._follow(stream):
+            self.stale += 1
+            return False
+        if seq in self._waiting or (self._next_seq is not None and seq < self._next_seq):
+            self.duplicates += 1
+            return False
+        self._waiting[seq] = item
+        self._end_seq = max(self._end_seq, seq + 1)
+        if seq == 0 and self._next_seq is None:
+            self._next_seq = 0
+        self._advance()
+        return True
+
+    def note_head(self, head: StreamHead) -> None:
+        """Learn what the sender has sent and can still resend."""
+        if not self._follow(head.stream):
+            return
+        self._end_seq = max(self._end_seq, head.next_seq)
+        if self._next_seq is None:
+            # A receiver that starts late begins where the sender still has something: what was before has been
+            # acknowledged by its predecessor.
+            self._next_seq = self._taken_seq = head.oldest_seq
+        for seq in range(self._next_seq, head.oldest_seq):
+            if seq in self._waiting:
+                self._ready.append(self._waiting.pop(seq))
+            else:
+                self.lost += 1
+        self._next_seq = max(self._next_seq, head.oldest_seq)
+        self._advance()
+
+    def take_ready(self) -> list[Item]:
+        """Messages that are next in order; taking them makes the next acknowledgement cover them."""
+        ready, self._ready = self._ready, []
+        if self._next_seq is not None:
+            self._taken_seq = self._next_seq
+        return ready
+
+    def acknowledgement(self, updates_owed: float = 0.0) -> Acknowledgement | None:
+        """What to tell the sender; None before anything is known of it."""
+        if self.stream is None or self._next_seq is None:
+            return None
+        missing: list[tuple[int, int]] = []
+        start = None
+        for seq in range(self._next_seq, self._end_seq + 1):
+            absent = seq < self._end_seq and seq not in self._waiting
+            if absent and start is None:
+                start = seq
+            elif not absent and start is not None:
+                missing.append((start, seq))
+                start = None
+                if len(missing) == MAX_RANGES:
+                    break
+        ranges = np.array(missing, dtype=np.int64).reshape(-1, 2)
+        return Acknowledgement(self.stream, self._taken_seq, ranges, updates_owed)
+
+    def _follow(self, stream: int) -> bool:
+        """Switch to a newer stream; False for an older one."""
+        if self.stream is not None and stream < self.stream:
+            return False
+        if self.stream != stream:
+            if self._next_seq is not None:
+                # The old sender's memory is gone: hand on what came of it, count the rest.
+                self.lost += self._end_seq - self._next_seq - len(self._waiting)
+            self._ready += [self._waiting[seq] for seq in sorted(self._waiting)]
+            self._waiting.clear()
+            self.stream, self._next_seq, self._end_seq, self._taken_seq = stream, None, 0, 0
+        return True
+
+    def _advance(self) -> None:
+        while self._next_seq is not None and self._next_seq in self._waiting:
+            self._ready.append(self._waiting.pop(self._next_seq))
+            self._next_seq += 1
+
+
+class JournalSender:
+    """The sender's side of a stream: publishes, retains, and repairs on a thread of its own.
+
+    ``put`` is called by one thread, costs one publication, and waits for nothing that is slow.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        incarnation: int,
+        settings: JournalSettings,
+        *,
+        topic: Topic,
+        resent: Topic,
+        head: Topic,
+        acknowledgement: Topic,
+        on_acknowledgement: Callable[[Acknowledgement], None] | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        self._clock = clock or SystemClock()
+        self._incarnation = incarnation
+        self._retained = RetainedMessages(round(settings.journal_s * 1e9), settings.journal_mib << 20)
+        self._bytes_per_s = settings.resend_kib_per_s * 1024
+        self._publisher = transport.publisher(topic)
+        self._resent_publisher = transport.publisher(resent)
+        self._head_publisher = transport.publisher(head)
+        self._on_acknowledgement = on_acknowledgement
+        self._lock = threading.Lock()
+        self._wake = threading.Condition()
+        self._acknowledgements: list[Acknowledgement] = []
+        self._stopping = False
+        self.resent = 0
+        """Messages sent again."""
+        self.refused = 0
+        """Acknowledgements that could not be read."""
+        transport.subscribe(acknowledgement, self._receive)
+        self._thread = threading.Thread(target=self._run, name=f"journal {topic.name}", daemon=True)
+
+    def start(self) -> None:
+        """Begin to repair."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop repairing; what is unacknowledged is given up."""
+        with self._wake:
+            self._stopping = True
+            self._wake.notify()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    @property
+    def unacknowledged(self) -> int:
+        """Messages retained."""
+        return len(self._retained)
+
+    @property
+    def given_up(self) -> int:
+        """Messages dropped unacknowledged."""
+        return self._retained.given_up
+
+    def put(self, seq: int, payload: bytes) -> None:
+        """Retain and publish message ``seq``."""
+        with self._lock:
+            self._retained.retain(seq, payload, self._clock.now_ns())
+        self._publisher.put(payload)
+
+    def republish(self, payload: bytes) -> None:
+        """Publish once more what :meth:`put` has published."""
+        self.resent += 1
+        self._publisher.put(payload)
+
+    def send_head(self) -> None:
+        """Tell the receiver what there is."""
+        with self._lock:
+            head = StreamHead(self._incarnation, self._retained.oldest_seq, self._retained.next_seq)
+        self._head_publisher.put(encode(head))
+
+    def _receive(self, payload: bytes) -> None:
+        try:
+            acknowledgement = decode(payload, Acknowledgement)
+        except MessageError as error:
+            self.refused += 1
+            if self.refused == 1:
+                logger.warning("dropped an acknowledgement: %s", error)
+            return
+        with self._wake:
+            self._acknowledgements.append(acknowledgement)
+            self._wake.notify()
+
+    def _run(self) -> None:
+        next_head_ns = 0
+        while True:
+            with self._wake:
+                if not self._acknowledgements and not self._stopping:
+                    self._wake.wait(HEAD_PERIOD_S)
+                if self._stopping:
+                    return
+                acknowledgements, self._acknowledgements = self._acknowledgements, []
+            if self._clock.now_ns() >= next_head_ns:
+                next_head_ns = self._clock.now_ns() + round(HEAD_PERIOD_S * 1e9)
+                self.send_head()
+            for acknowledgement in acknowledgements:
+                if acknowledgement.stream == self._incarnation:
+                    self._take(acknowledgement, newest=acknowledgement is acknowledgements[-1])
+
+    def _take(self, acknowledgement: Acknowledgement, newest: bool) -> None:
+        with self._lock:
+            self._retained.acknowledge(acknowledgement.next_seq)
+        if self._on_acknowledgement:
+            self._on_acknowledgement(acknowledgement)
+        if newest:
+            self._resend(acknowledgement)
+
+    def _resend(self, acknowledgement: Acknowledgement) -> None:
+        ranges = ((int(start), int(end)) for start, end in acknowledgement.missing)
+        payloads = self._retained.due(ranges, self._clock.now_ns())
+        while True:
+            with self._lock:
+                payload = next(payloads, None)
+            if payload is None:
+                return
+            self._resent_publisher.put(payload)
+            self.resent += 1
+            with self._wake:
+                # A newer acknowledgement knows better what is missing.
+                if self._stopping or self._wake.wait_for(lambda: self._stopping, len(payload) / self._bytes_per_s):
+                    return
+                if self._acknowledgements:
+                    return

@@ -1,0 +1,81 @@
+"""The networks after the encoder: two hidden layers with ReLU (thesis 4.2.2)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+class Actor(nn.ModuleList):
+    """Observation vector -> mean and unbounded log standard deviation.
+
+    Parameters are named ``0.weight`` (H, inputs), ``0.bias`` ... ``2.bias``.
+    """
+
+    def __init__(
+        self, inputs: int, hidden_size: int, action_size: int, *, dtype: torch.dtype, wide: torch.dtype
+    ) -> None:
+        """Create an actor with parameters in ``dtype`` whose hidden-to-hidden layer computes in ``wide``."""
+        super().__init__(
+            [
+                nn.Linear(inputs, hidden_size, dtype=dtype),
+                nn.Linear(hidden_size, hidden_size, dtype=dtype),
+                nn.Linear(hidden_size, 2 * action_size, dtype=dtype),
+            ]
+        )
+        self._wide = wide
+
+    def forward(self, vector: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, inputs) -> two of (B, A)."""
+        first, hidden, last = self
+        assert isinstance(hidden, nn.Linear)
+        x = functional.relu_(first(vector)).to(self._wide)
+        x = functional.relu_(functional.linear(x, hidden.weight.to(self._wide), hidden.bias.to(self._wide)))
+        mean, log_std = last(x.to(vector.dtype)).chunk(2, dim=1)
+        return mean, log_std
+
+
+class TwinQ(nn.Module):
+    """Two critics q_1, q_2 as one batched product per layer: (observation vector, action) -> action values."""
+
+    def __init__(
+        self,
+        inputs: int,
+        hidden_size: int,
+        rng: np.random.Generator,
+        *,
+        dtype: torch.dtype,
+        wide: torch.dtype,
+    ) -> None:
+        """Create two critics with independent random layers.
+
+        Args:
+            inputs: sizes of observation vector and action together.
+            hidden_size: width of each critic's hidden layers.
+            rng: source of the initial parameters.
+            dtype: number format of the parameters.
+            wide: number format in which the hidden-to-hidden layers compute.
+        """
+        super().__init__()
+        self._wide = wide
+
+        def layer(n_in: int, n_out: int) -> tuple[nn.Parameter, nn.Parameter]:
+            bound = 1.0 / math.sqrt(n_in)
+            weight = torch.from_numpy(rng.uniform(-bound, bound, (2, n_in, n_out))).to(dtype)
+            return nn.Parameter(weight), nn.Parameter(torch.zeros(2, 1, n_out, dtype=dtype))
+
+        self.weight0, self.bias0 = layer(inputs, hidden_size)
+        self.weight1, self.bias1 = layer(hidden_size, hidden_size)
+        self.weight2, self.bias2 = layer(hidden_size, 1)
+
+    def forward(self, vector: Tensor, action: Tensor) -> Tensor:
+        """(B, vector), (B, A) -> (2, B)."""
+        inputs = torch.cat([vector, action], dim=1).expand(2, -1, -1)
+        x = functional.relu_(torch.baddbmm(self.bias0, inputs, self.weight0)).to(self._wide)
+        weight, bias = self.weight1.to(self._wide), self.bias1.to(self._wide)
+        x = functional.relu_(torch.baddbmm(bias, x, weight)).to(vector.dtype)
+        return torch.baddbmm(self.bias2, x, self.weight2).squeeze(2)

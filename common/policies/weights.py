@@ -1,0 +1,153 @@
+"""A policy's parameters by name, and as the one flat buffer that a learner pushes.
+
+Names and shapes (A actions, P proprioception, H hidden size, K = 3 * 3 convolution kernels)::
+
+    encoder.0.weight  (32, S * C, 3, 3)    only with a camera
+    encoder.0.bias    (32,)
+    encoder.1 ... encoder.3                 the last without bias, which a spatial softmax cannot see
+    actor.0.weight    (H, [64] + P + A)     observation: encoder features, proprioception, previous action
+    actor.0.bias      (H,)
+    actor.1.weight    (H, H)
+    actor.1.bias      (H,)
+    actor.2.weight    (2 A, H)              mean, then unbounded log standard deviation
+    actor.2.bias      (2 A,)
+    log_std_bounds    (2,)                  what the log standard deviation is mapped to
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from common.errors import MessageError
+from common.messages import Float32Array, PolicyWeights, TaskSpec
+from common.networks.sizes import CHANNELS, FEATURES, KERNEL
+
+_WIRE_DTYPES: dict[str, np.dtype[Any]] = {"float32": np.dtype("<f4"), "float16": np.dtype("<f2")}
+
+
+def parameter_shapes(spec: TaskSpec, hidden_size: int, encoder_strides: Sequence[int]) -> dict[str, list[int]]:
+    """Return the names and shapes of a policy's parameters, in the order of the buffer."""
+    sizes = spec.dimensions
+    shapes: dict[str, list[int]] = {}
+    inputs = sizes.P + sizes.A
+    if spec.has_camera:
+        channels = sizes.S * sizes.C
+        for layer in range(len(encoder_strides)):
+            shapes[f"encoder.{layer}.weight"] = [CHANNELS, channels, KERNEL, KERNEL]
+            if layer < len(encoder_strides) - 1:
+                shapes[f"encoder.{layer}.bias"] = [CHANNELS]
+            channels = CHANNELS
+        inputs += FEATURES
+    for layer, (rows, columns) in enumerate(
+        [(hidden_size, inputs), (hidden_size, hidden_size), (2 * sizes.A, hidden_size)]
+    ):
+        shapes[f"actor.{layer}.weight"] = [rows, columns]
+        shapes[f"actor.{layer}.bias"] = [rows]
+    shapes["log_std_bounds"] = [2]
+    return shapes
+
+
+def initial_parameters(
+    spec: TaskSpec, hidden_size: int, encoder_strides: Sequence[int], rng: np.random.Generator
+) -> dict[str, Float32Array]:
+    """Return random layers under a zero one: N(0, 1) before the tanh, whatever the observation (thesis 4.2)."""
+    parameters: dict[str, Float32Array] = {}
+    for name, shape in parameter_shapes(spec, hidden_size, encoder_strides).items():
+        parameters[name] = np.zeros(shape, np.float32)
+        if name.endswith("weight") and name != "actor.2.weight":
+            bound = 1.0 / math.sqrt(math.prod(shape[1:]))
+            parameters[name] = rng.uniform(-bound, bound, shape).astype(np.float32)
+    parameters["log_std_bounds"] = np.array([-10.0, 10.0], np.float32)
+    return parameters
+
+
+def pack_weights(
+    parameters: Mapping[str, npt.NDArray[Any]],
+    *,
+    version: int,
+    updates: int,
+    algorithm: str,
+    hidden_size: int,
+    encoder_strides: Sequence[int],
+    dtype: str,
+) -> PolicyWeights:
+    """Return the message that carries ``parameters``.
+
+    Args:
+        parameters: name -> array; the order is kept.
+        version, updates, algorithm, hidden_size, encoder_strides: see :class:`PolicyWeights`.
+        dtype: ``float32`` or ``float16``.
+
+    Raises:
+        MessageError: a parameter is not finite, or too large for ``dtype``.
+    """
+    wire = _wire_dtype(dtype)
+    flat = np.concatenate([np.ravel(values) for values in parameters.values()])
+    with np.errstate(over="ignore"):
+        buffer = flat.astype(wire).view(np.uint8)
+    if not np.isfinite(buffer.view(wire)).all():
+        raise MessageError(f"policy weights after {updates} updates are not finite numbers in {dtype}")
+    return PolicyWeights(
+        version=version,
+        updates=updates,
+        algorithm=algorithm,
+        hidden_size=hidden_size,
+        encoder_strides=np.array(encoder_strides, np.int64),
+        names=list(parameters),
+        shapes=[list(values.shape) for values in parameters.values()],
+        dtype=dtype,
+        buffer=buffer,
+        digest=_digest(buffer),
+    )
+
+
+def unpack_weights(weights: PolicyWeights, expected: Mapping[str, list[int]]) -> dict[str, Float32Array]:
+    """Return name -> array, for names and shapes that the task's policy has.
+
+    Raises:
+        MessageError: the buffer was changed on its way, does not fit the names and shapes, is not finite, or
+            belongs to another network than ``expected``.
+    """
+    wire = _wire_dtype(weights.dtype)
+    digest = _digest(weights.buffer)
+    if weights.digest != digest:
+        raise MessageError(f"policy weights {weights.version}: expected digest {weights.digest}, got {digest}")
+    got = dict(zip(weights.names, weights.shapes, strict=False))
+    if len(weights.names) != len(weights.shapes) or got != expected:
+        differing = sorted(n for n in got.keys() | expected.keys() if got.get(n) != expected.get(n))
+        raise MessageError(
+            f"policy weights {weights.version} are for another network: {differing[0] if differing else 'names'}: "
+            f"expected shape {expected.get(differing[0]) if differing else None}, "
+            f"got {got.get(differing[0]) if differing else None}"
+        )
+    size = sum(math.prod(shape) for shape in weights.shapes)
+    if weights.buffer.nbytes != size * wire.itemsize:
+        raise MessageError(
+            f"policy weights {weights.version}: expected {size * wire.itemsize} bytes, got {weights.buffer.nbytes}"
+        )
+    flat = weights.buffer.view(wire).astype(np.float32)
+    if not np.isfinite(flat).all():
+        raise MessageError(f"policy weights {weights.version}: expected finite numbers, got NaN or infinity")
+    parameters: dict[str, Float32Array] = {}
+    start = 0
+    for name, shape in zip(weights.names, weights.shapes, strict=True):
+        end = start + math.prod(shape)
+        parameters[name] = flat[start:end].reshape(shape)
+        start = end
+    return parameters
+
+
+def _wire_dtype(dtype: str) -> np.dtype[Any]:
+    if dtype not in _WIRE_DTYPES:
+        raise MessageError(f"policy weights: expected dtype in {list(_WIRE_DTYPES)}, got {dtype!r}")
+    return _WIRE_DTYPES[dtype]
+
+
+def _digest(buffer: npt.NDArray[np.uint8]) -> str:
+    return hashlib.blake2b(np.ascontiguousarray(buffer).data, digest_size=16).hexdigest()

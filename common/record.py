@@ -1,0 +1,130 @@
+"""A service's part of the run's record, written by a thread of its own: the disk never delays anyone.
+
+``RUN_DIR/`` afterwards holds, from this file, ``parts/SERVICE-INCARNATION.json`` (the service's counts, replaced
+about once a second, so a killed service leaves its last ones), ``metrics/SERVICE.csv``, ``tensorboard/SERVICE/`` and
+the tables a service adds rows to.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import os
+import queue
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+logger = logging.getLogger(__name__)
+
+_QUEUE_LENGTH = 20_000
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replace ``path`` in one step: a reader sees the old text or the new one, never a piece."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)
+
+
+def read_parts(directory: Path, service: str = "*") -> list[dict[str, Any]]:
+    """All readable parts of a run's record, oldest incarnation first."""
+    parts = []
+    for path in directory.glob(f"parts/{service}-*.json"):
+        try:
+            parts.append(json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, json.JSONDecodeError) as error:
+            logger.warning("%s: left out of the record: %s", path, error)
+    return sorted(parts, key=lambda part: int(part.get("incarnation", 0)))
+
+
+class RunRecord:
+    """Queue in front of the disk. Every method returns at once; what does not fit is dropped and counted."""
+
+    def __init__(self, directory: Path, service: str, incarnation: int) -> None:
+        self.directory = directory
+        self.dropped = 0
+        """Entries that were not written, because the queue was full or the disk refused."""
+        self._service, self._incarnation = service, incarnation
+        self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(_QUEUE_LENGTH)
+        self._tables: dict[str, tuple[TextIO, Any, Sequence[str]]] = {}
+        self._tensorboard: Any = None
+        self._thread = threading.Thread(target=self._run, name="record", daemon=True)
+
+    def start(self) -> None:
+        """Begin to write."""
+        self._thread.start()
+
+    def close(self, timeout_s: float = 3.0) -> None:
+        """Write what is queued, then stop; gives up after ``timeout_s``."""
+        if self._thread.is_alive():
+            self._put(None)
+            self._thread.join(timeout_s)
+
+    def part(self, values: Mapping[str, Any]) -> None:
+        """Replace this incarnation's part."""
+        path = self.directory / "parts" / f"{self._service}-{self._incarnation}.json"
+        content = {"service": self._service, "incarnation": self._incarnation, "pid": os.getpid(), **values}
+        self._put(lambda: write_atomically(path, json.dumps(content, indent=1)))
+
+    def row(self, table: str, values: Mapping[str, Any]) -> None:
+        """Append a row to ``RUN_DIR/<table>.csv``; all rows of a table have the same columns."""
+        row = dict(values)
+        self._put(lambda: self._write_row(table, row))
+
+    def metrics(self, step: int, wall_s: float, values: Mapping[str, float]) -> None:
+        """Record gauges at ``step``: a row of ``metrics/SERVICE.csv`` and points in TensorBoard."""
+        row = {"incarnation": self._incarnation, "step": step, "wall_s": round(wall_s, 3), **values}
+        self._put(lambda: self._write_metrics(step, row))
+
+    def _put(self, entry: Callable[[], None] | None) -> None:
+        try:
+            self._queue.put_nowait(entry)
+        except queue.Full:
+            self.dropped += 1
+
+    def _run(self) -> None:
+        while (entry := self._queue.get()) is not None:
+            try:
+                entry()
+            except OSError as error:
+                self.dropped += 1
+                if self.dropped == 1:
+                    logger.error("%s: the record cannot be written: %s", self.directory, error)
+        for file, _, _ in self._tables.values():
+            file.close()
+        if self._tensorboard:
+            self._tensorboard.close()
+
+    def _write_row(self, table: str, row: Mapping[str, Any]) -> None:
+        if table not in self._tables:
+            self._tables[table] = self._open_table(table, list(row))
+        file, writer, columns = self._tables[table]
+        writer.writerow([row.get(column, "") for column in columns])
+        file.flush()
+
+    def _open_table(self, table: str, columns: list[str]) -> tuple[TextIO, Any, Sequence[str]]:
+        path = self.directory / f"{table}.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() and path.stat().st_size:
+            with path.open(encoding="utf-8", newline="") as existing:
+                if next(csv.reader(existing), []) != columns:
+                    path = path.with_name(f"{path.stem}-{self._incarnation}.csv")
+        file = path.open("a", encoding="utf-8", newline="")
+        writer = csv.writer(file)
+        if file.tell() == 0:
+            writer.writerow(columns)
+        return file, writer, columns
+
+    def _write_metrics(self, step: int, row: Mapping[str, float]) -> None:
+        self._write_row(f"metrics/{self._service}", row)
+        if self._tensorboard is None:
+            from tensorboardX import SummaryWriter
+
+            self._tensorboard = SummaryWriter(str(self.directory / "tensorboard" / self._service))
+        for name, value in row.items():
+            if name not in ("incarnation", "step"):
+                self._tensorboard.add_scalar(f"{self._service}/{name}", value, step)

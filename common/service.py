@@ -1,0 +1,374 @@
+"""What every service has around its own loop: arguments, logging, signals, heartbeat, record, a clean end."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import logging
+import logging.handlers
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from common import topics
+from common.clock import Clock, SystemClock
+from common.codec import decode, encode
+from common.config import load_config
+from common.errors import MessageError, RelodError, ServiceError
+from common.inbox import Inbox, Refusals
+from common.messages import Command, CommandReply, Finished, Status, TaskSpec
+from common.record import RunRecord
+from common.run_settings import RunSettings
+from common.transport import Transport, ZenohTransport
+
+Config = TypeVar("Config")
+logger = logging.getLogger(__name__)
+
+HEARTBEAT_S = 0.2
+"""Period of the status message."""
+RECORD_S = 1.0
+"""Period of the part and the metrics."""
+GONE_AFTER_S = 1.5
+"""A peer whose last status is older than this counts as gone."""
+DRAIN_TIMEOUT_S = 30.0
+"""Longest time a service waits at the end for messages that are still on their way."""
+STOP_TIMEOUT_S = 2.0
+"""The same when it was asked to stop (Ctrl-C)."""
+
+
+@dataclass
+class Peer:
+    """The last that was heard of another service."""
+
+    status: Status
+    at_ns: int
+
+
+class Service:
+    """One running service: identity, transport, peers, record. The loop is the service's own class."""
+
+    def __init__(
+        self,
+        name: str,
+        run: RunSettings,
+        transport: Transport,
+        clock: Clock | None = None,
+    ) -> None:
+        self.name = name
+        self.run = run
+        self.transport = transport
+        self.clock = clock or SystemClock()
+        self.incarnation = time.time_ns()
+        self.started_ns = self.clock.now_ns()
+        self.refusals = Refusals()
+        self.record = RunRecord(Path(run.directory), name, self.incarnation)
+        self.stopping = threading.Event()
+        """Set by a signal, a ``stop`` command, or a newer incarnation of this service."""
+        self.failure: str | None = None
+        """Why the service has to end with exit code 1."""
+        self.wake = threading.Condition()
+        """Notified when a message has arrived or the service is asked to stop."""
+        self.state = "starting"
+        self.counters: Callable[[], dict[str, float]] = dict
+        """The service's counts and gauges: sent with the heartbeat, recorded as metrics."""
+        self.details: Callable[[], dict[str, Any]] = dict
+        """What else belongs into the service's part of the record."""
+        self._peers: dict[str, Peer] = {}
+        self._foreign: set[str] = set()
+        self._finished: Finished | None = None
+        self._heart_wake = threading.Condition()
+        self._heart = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+        self._heart_stop = False
+        self._status_publisher = transport.publisher(topics.STATUS)
+        self._status_inbox = Inbox(
+            transport,
+            topics.STATUS,
+            Status,
+            self._heart_wake,
+            self.clock,
+            self.refusals,
+            capacity=64,
+            any_run=True,
+        )
+        self._finished_inbox = (
+            None
+            if name == topics.ROBOT_BRIDGE
+            else Inbox(transport, topics.FINISHED, Finished, self._heart_wake, self.clock, self.refusals)
+        )
+
+    def start(self) -> None:
+        """Begin the heartbeat and the record."""
+        self.record.start()
+        self._heart.start()
+
+    def stop(self, reason: str) -> None:
+        """Ask the service's loop to end."""
+        if not self.stopping.is_set():
+            logger.info("stopping: %s", reason)
+            self.stopping.set()
+        with self.wake:
+            self.wake.notify_all()
+
+    def close(self) -> None:
+        """Say goodbye, write the last part, leave the mesh."""
+        self.state = "stopped"
+        with self._heart_wake:
+            self._heart_stop = True
+            self._heart_wake.notify()
+        if self._heart.is_alive():
+            self._heart.join()
+        self._send_status()
+        self._write_record()
+        self.record.close()
+        self.transport.close()
+
+    @property
+    def finished(self) -> Finished | None:
+        """The bridge's word that the run is over, once it has come."""
+        return self._finished
+
+    def peer_age_s(self, service: str) -> float:
+        """Seconds since the last status of ``service``; infinite before the first and after its goodbye."""
+        peer = self._peers.get(service)
+        if peer is None or peer.status.state == "stopped":
+            return float("inf")
+        return (self.clock.now_ns() - peer.at_ns) / 1e9
+
+    def peer_state(self, service: str) -> str:
+        """State of ``service``; ``gone`` if nothing was heard of it for a while."""
+        return self._peers[service].status.state if self.peer_age_s(service) < GONE_AFTER_S else "gone"
+
+    def peer_counter(self, service: str, name: str) -> float:
+        """A count that ``service`` last reported; 0 before it did."""
+        peer = self._peers.get(service)
+        return peer.status.counters.get(name, 0.0) if peer else 0.0
+
+    def query_spec(self) -> TaskSpec | None:
+        """Ask the bridge what the task looks like until it answers; None if asked to stop first."""
+        warned_ns = self.clock.now_ns()
+        while not self.stopping.is_set():
+            asked_ns = self.clock.now_ns()
+            payload = self.transport.query(topics.SPEC)
+            if payload is not None:
+                try:
+                    return decode(payload, TaskSpec)
+                except MessageError as error:
+                    raise ServiceError(f"the bridge's task specification cannot be used: {error}") from error
+            if self.clock.now_ns() - warned_ns > 10e9:
+                warned_ns = self.clock.now_ns()
+                logger.warning("no robot_bridge has answered yet; is it running, and do the endpoints match?")
+            # Nobody there answers at once: ask again in a moment.
+            self.stopping.wait(max(0.0, 0.1 - (self.clock.now_ns() - asked_ns) / 1e9))
+        return None
+
+    def serve_commands(self, handlers: dict[str, Callable[[], str]]) -> None:
+        """Answer ``command/<service>`` queries; ``stop`` is known to every service."""
+
+        def stop() -> str:
+            self.stop("stop command")
+            return "stopping"
+
+        known = {"stop": stop, **handlers}
+
+        def answer(payload: bytes) -> bytes:
+            try:
+                command = decode(payload, Command)
+            except MessageError as error:
+                return encode(CommandReply(False, str(error)))
+            if command.name not in known:
+                return encode(CommandReply(False, f"expected one of {sorted(known)}, got {command.name!r}"))
+            return encode(CommandReply(True, known[command.name]()))
+
+        self.transport.serve(topics.command_topic(self.name), answer)
+
+    def drain(self, is_drained: Callable[[], bool], work: Callable[[], None]) -> bool:
+        """End of the run: ``work`` until nothing is on its way here, then until no peer needs this service.
+
+        Returns False if the time was up first.
+        """
+        self.state = "draining"
+        begun_ns = self.clock.now_ns()
+        while True:
+            limit_s = STOP_TIMEOUT_S if self._ends_early() else DRAIN_TIMEOUT_S
+            if (self.clock.now_ns() - begun_ns) / 1e9 > limit_s:
+                logger.warning("not drained after %.0f s; peers: %s", limit_s, self._peer_states())
+                return False
+            work()
+            if is_drained():
+                self.state = "drained"
+                if all(state in ("drained", "gone", "stopped") for state in self._peer_states().values()):
+                    return True
+            with self.wake:
+                self.wake.wait(0.02)
+
+    def _ends_early(self) -> bool:
+        return self.stopping.is_set() or (self._finished is not None and self._finished.reason != "steps")
+
+    def _peer_states(self) -> dict[str, str]:
+        return {name: self.peer_state(name) for name in topics.SERVICES if name != self.name}
+
+    def _beat(self) -> None:
+        next_status_ns = next_record_ns = 0
+        while True:
+            with self._heart_wake:
+                if self._heart_stop:
+                    return
+                if not self._status_inbox:
+                    self._heart_wake.wait(HEARTBEAT_S / 2)
+            self._take_messages()
+            now_ns = self.clock.now_ns()
+            if now_ns >= next_status_ns:
+                next_status_ns = now_ns + round(HEARTBEAT_S * 1e9)
+                self._send_status()
+            if now_ns >= next_record_ns:
+                next_record_ns = now_ns + round(RECORD_S * 1e9)
+                self._write_record()
+
+    def _take_messages(self) -> None:
+        for status, at_ns in self._status_inbox.take():
+            self._hear(status, at_ns)
+        if self._finished_inbox and (finished := self._finished_inbox.take_newest()):
+            newest = self._finished is None or finished.message.incarnation >= self._finished.incarnation
+            if newest:
+                self._finished = finished.message
+                with self.wake:
+                    self.wake.notify_all()
+
+    def _hear(self, status: Status, at_ns: int) -> None:
+        if status.run != self.run.id:
+            if status.run not in self._foreign:
+                self._foreign.add(status.run)
+                logger.error(
+                    "%s on this mesh belongs to run %r, expected %r: check [run] id and the endpoints",
+                    status.service,
+                    status.run,
+                    self.run.id,
+                )
+            return
+        if status.service == self.name:
+            if status.incarnation > self.incarnation and status.state != "stopped":
+                self.failure = f"a newer {self.name} has joined this run; two cannot serve one robot"
+                self.stop(self.failure)
+            return
+        known = self._peers.get(status.service)
+        if known and status.incarnation < known.status.incarnation:
+            return
+        if known is None or known.status.incarnation != status.incarnation:
+            logger.info("%s has joined", status.service)
+        self._peers[status.service] = Peer(status, at_ns)
+
+    def _send_status(self) -> None:
+        counters = {name: float(value) for name, value in self.counters().items()}
+        status = Status(self.name, self.run.id, self.incarnation, self.state, counters)
+        self._status_publisher.put(encode(status))
+
+    def _write_record(self) -> None:
+        counters = self.counters()
+        wall_s = (self.clock.now_ns() - self.started_ns) / 1e9
+        self.record.part(
+            {
+                "state": self.state,
+                "failure": self.failure,
+                "run": self.run.id,
+                "wall_s": round(wall_s, 3),
+                "counters": counters,
+                "bytes_sent": dict(self.transport.bytes_sent),
+                "bytes_received": dict(self.transport.bytes_received),
+                "refused_messages": dict(self.refusals.counts),
+                "record_entries_dropped": self.record.dropped,
+                **self.details(),
+            }
+        )
+        step = int(counters.get("steps", counters.get("updates", counters.get("rows", 0))))
+        self.record.metrics(step, wall_s, counters)
+
+
+def run_service(
+    name: str,
+    config_class: type[Config],
+    serve: Callable[[Service, Config], None],
+    arguments: Sequence[str] | None = None,
+    description: str | None = None,
+) -> int:
+    """Run one service from its command line until it has ended; return the process's exit code."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m services.{name}",
+        description=description,
+        epilog="`python -m deploy.launch MODE --task TASK --write-config DIR` writes a configuration for each service.",
+    )
+    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="this service's TOML file")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        help="override a setting; may be given several times",
+    )
+    options = parser.parse_args(arguments)
+    try:
+        config = load_config(config_class, options.config, options.set)
+        return _run(name, config, serve)
+    except RelodError as error:
+        print(f"{name}: error: {error}", file=sys.stderr)
+        logger.error("%s", error)
+        return 1
+    finally:
+        logging.shutdown()
+
+
+def _run(name: str, config: Any, serve: Callable[[Service, Any], None]) -> int:
+    listener = _start_logging(Path(config.run.directory), name)
+    # The interpreter's default of 5 ms is how long a computing thread may keep a waiting real-time thread out.
+    sys.setswitchinterval(5e-4)
+    try:
+        service = Service(name, config.run, ZenohTransport(config.run, config.transport))
+        # A service started in the background by a script inherits ignored signals: install handlers explicitly.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda number, _: service.stop(signal.Signals(number).name))
+        logger.info("%s starts: run %s, process %d", name, config.run.id, os.getpid())
+        try:
+            service.start()
+            gc.freeze()
+            serve(service, config)
+        except RelodError as error:
+            service.failure = str(error)
+            raise
+        except Exception as error:
+            service.failure = f"{type(error).__name__}: {error}"
+            logger.exception("unexpected error")
+            raise ServiceError(f"unexpected {type(error).__name__}: {error}; see the log") from error
+        finally:
+            service.close()
+            logger.info("%s has ended", name)
+        if service.failure:
+            raise ServiceError(service.failure)
+        return 0
+    finally:
+        listener.stop()
+
+
+def _start_logging(directory: Path, name: str) -> logging.handlers.QueueListener:
+    """Log to ``RUN_DIR/logs/NAME.log`` and to the terminal, from a thread of its own."""
+    try:
+        (directory / "logs").mkdir(parents=True, exist_ok=True)
+        file = logging.FileHandler(directory / "logs" / f"{name}.log", encoding="utf-8")
+    except OSError as error:
+        raise ServiceError(f"{directory}: the run's folder cannot be written: {error.strerror}") from error
+    formatter = logging.Formatter(f"%(asctime)s.%(msecs)03d {name} %(levelname)s %(message)s", "%H:%M:%S")
+    terminal = logging.StreamHandler()
+    for handler in (file, terminal):
+        handler.setFormatter(formatter)
+    entries: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
+    listener = logging.handlers.QueueListener(entries, file, terminal)
+    listener.start()
+    root = logging.getLogger()
+    root.handlers = [logging.handlers.QueueHandler(entries)]
+    root.setLevel(logging.INFO)
+    return listener

@@ -1,0 +1,52 @@
+"""Actor and twin critics."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from common.networks.mlp import Actor, TwinQ
+
+
+def make_critics(wide=torch.float32):
+    return TwinQ(7, 32, np.random.default_rng(0), dtype=torch.float32, wide=wide)
+
+
+def test_the_batched_critics_are_two_independent_perceptrons():
+    critics = make_critics()
+    vector, action = torch.randn(5, 4), torch.randn(5, 3)
+    values = critics(vector, action)
+    assert values.shape == (2, 5)
+    assert not torch.allclose(values[0], values[1])
+    for twin in range(2):
+        x = torch.cat([vector, action], dim=1)
+        for layer in range(3):
+            weight, bias = getattr(critics, f"weight{layer}")[twin], getattr(critics, f"bias{layer}")[twin]
+            x = functional.linear(x if layer == 0 else x.relu(), weight.T, bias[0])
+        torch.testing.assert_close(values[twin], x[:, 0])
+
+
+def test_initial_layers_lie_within_the_inverse_root_of_their_inputs():
+    critics = make_critics()
+    assert 0.9 * 7**-0.5 < critics.weight0.abs().max() <= 7**-0.5
+    assert 0.9 * 32**-0.5 < critics.weight1.abs().max() <= 32**-0.5
+
+
+def test_the_actor_returns_mean_and_log_std_of_its_last_layer():
+    actor = Actor(4, 16, 3, dtype=torch.float32, wide=torch.float32)
+    with torch.no_grad():
+        actor[2].weight.zero_()
+        actor[2].bias.copy_(torch.arange(6.0))
+    mean, log_std = actor(torch.randn(2, 4))
+    assert mean.tolist() == [[0.0, 1.0, 2.0]] * 2
+    assert log_std.tolist() == [[3.0, 4.0, 5.0]] * 2
+
+
+def test_a_bfloat16_hidden_layer_changes_values_little_and_gradients_stay_float32():
+    vector, action = torch.randn(64, 4), torch.randn(64, 3)
+    full, half = make_critics(), make_critics(wide=torch.bfloat16)
+    values = half(vector, action)
+    torch.testing.assert_close(values, full(vector, action), atol=5e-3, rtol=0.0)
+    gradients = torch.autograd.grad(values.sum(), list(half.parameters()))
+    assert {gradient.dtype for gradient in gradients} == {torch.float32}

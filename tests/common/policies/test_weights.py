@@ -1,0 +1,118 @@
+"""Weights on the wire: exact in float32, close in float16, refused when damaged."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from common.codec import decode, encode
+from common.errors import MessageError
+from common.messages import PolicyWeights
+from common.policies import policy_from_weights
+from common.policies.weights import initial_parameters, pack_weights, parameter_shapes, unpack_weights
+from tests.reference.tasks import make_spec
+
+SPEC = make_spec((32, 36, 3))
+STRIDES = (2, 2, 1, 1)
+SHAPES = parameter_shapes(SPEC, 16, STRIDES)
+
+
+def make_parameters():
+    return initial_parameters(SPEC, 16, STRIDES, np.random.default_rng(0))
+
+
+def make_weights(parameters=None, dtype="float32"):
+    return pack_weights(
+        make_parameters() if parameters is None else parameters,
+        version=3,
+        updates=150,
+        algorithm="sac",
+        hidden_size=16,
+        encoder_strides=STRIDES,
+        dtype=dtype,
+    )
+
+
+def with_buffer(weights, values):
+    """Return the weights with another buffer and a digest that fits it."""
+    buffer = np.frombuffer(values.tobytes(), np.uint8)
+    return replace(weights, buffer=buffer, digest=hashlib.blake2b(buffer.data, digest_size=16).hexdigest())
+
+
+def test_shapes_are_those_of_the_thesis():
+    # 9 channels of three RGB frames; 64 features + 3 proprioception + 2 previous action; mean and log std of 2.
+    assert SHAPES["encoder.0.weight"] == [32, 9, 3, 3]
+    assert SHAPES["actor.0.weight"] == [16, 69]
+    assert SHAPES["actor.2.weight"] == [4, 16]
+    assert "encoder.0.weight" not in parameter_shapes(make_spec(), 16, STRIDES)
+
+
+def test_float32_arrives_to_the_last_bit_through_the_codec():
+    parameters = make_parameters()
+    arrived = unpack_weights(decode(encode(make_weights()), PolicyWeights), SHAPES)
+    assert list(arrived) == list(parameters)
+    for name, values in parameters.items():
+        np.testing.assert_array_equal(arrived[name], values)
+
+
+def test_float16_halves_the_bytes_and_keeps_values_close():
+    parameters, weights = make_parameters(), make_weights(dtype="float16")
+    assert weights.buffer.nbytes * 2 == make_weights().buffer.nbytes
+    for name, values in unpack_weights(weights, SHAPES).items():
+        assert values.dtype == np.float32
+        np.testing.assert_allclose(values, parameters[name], rtol=2**-11, atol=1e-7)
+
+
+def test_a_changed_byte_is_refused_by_the_digest():
+    weights = make_weights()
+    buffer = weights.buffer.copy()
+    buffer[1000] ^= 1
+    with pytest.raises(MessageError, match="digest"):
+        unpack_weights(replace(weights, buffer=buffer), SHAPES)
+
+
+def test_weights_of_another_network_are_refused_naming_what_differs():
+    with pytest.raises(MessageError, match=r"actor.0.bias.*\[32\].*\[16\]"):
+        unpack_weights(make_weights(), parameter_shapes(SPEC, 32, STRIDES))
+    with pytest.raises(MessageError, match="encoder"):
+        policy_from_weights(make_spec(), make_weights())
+
+
+def test_a_buffer_of_the_wrong_length_is_refused():
+    weights = make_weights()
+    values = weights.buffer.view(np.float32)[:-1]
+    with pytest.raises(MessageError, match="bytes"):
+        unpack_weights(with_buffer(weights, values), SHAPES)
+
+
+def test_numbers_that_are_not_finite_are_refused_on_both_sides():
+    parameters = make_parameters()
+    parameters["actor.1.bias"][0] = np.nan
+    with pytest.raises(MessageError, match="not finite"):
+        make_weights(parameters)
+    weights = make_weights()
+    values = np.frombuffer(weights.buffer.tobytes(), np.uint32).copy()
+    values[7] = 0x7F800000  # infinity
+    with pytest.raises(MessageError, match="finite"):
+        unpack_weights(with_buffer(weights, values), SHAPES)
+
+
+def test_a_value_too_large_for_float16_is_refused_by_the_sender():
+    parameters = make_parameters()
+    parameters["actor.1.bias"][0] = 1e6
+    with pytest.raises(MessageError, match="float16"):
+        make_weights(parameters, dtype="float16")
+
+
+def test_an_unknown_number_format_is_refused():
+    with pytest.raises(MessageError, match="bfloat16"):
+        unpack_weights(replace(make_weights(), dtype="bfloat16"), SHAPES)
+
+
+@pytest.mark.parametrize("strides", [[], [2, 2, 0, 1], [2, 2, 2, 2, 2, 2]])
+def test_strides_that_do_not_fit_the_task_are_refused(strides):
+    with pytest.raises(MessageError):
+        policy_from_weights(SPEC, replace(make_weights(), encoder_strides=np.array(strides, np.int64)))
