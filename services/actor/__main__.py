@@ -1,0 +1,34 @@
+"""``python -m services.actor --config FILE``: computes actions."""
+
+from __future__ import annotations
+
+import sys
+
+from common import topics
+from common.algorithms.presets import resolve_config
+from common.policies import initial_policy
+from common.service import Service, run_service
+from services.actor.actor import Actor
+from services.actor.config import ActorConfig
+
+
+def serve(service: Service, config: ActorConfig) -> None:
+    """Learn from the bridge what the task is, build the initial policy, act."""
+    spec = service.query_spec()
+    if spec is None:
+        return
+    if spec.has_camera:
+        # Only the policies of camera tasks compute with torch, and torch's threads are set before its first use.
+        import torch
+
+        torch.set_num_threads(config.actor.threads)
+    name = config.algorithm.name
+    algorithm = resolve_config(
+        name, config.algorithm.preset or spec.algorithm_presets.get(name, ""), config.algorithm.overrides
+    )
+    policy = initial_policy(spec, algorithm.hidden_size, algorithm.encoder_strides, config.run.seed)
+    Actor(service, spec, policy, config.actor).run()
+
+
+if __name__ == "__main__":
+    sys.exit(run_service(topics.ACTOR, ActorConfig, serve, description=__doc__))

@@ -1,0 +1,156 @@
+"""The actor: answers the newest observation at once, and sends experience on to replay.
+
+::
+
+    TimeStep ─▶ newest? ─▶ frame stack ─▶ policy ─▶ Action          (this loop)
+        └────▶ in order, once, with extras ─▶ Experience            (services.actor.forwarding)
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from common import topics
+from common.codec import encode
+from common.errors import MessageError
+from common.frame_stack import FrameStack, Stack
+from common.inbox import Arrived, Inbox
+from common.messages import Action, PolicyExtras, TaskSpec, TimeStep, UInt8Array
+from common.policies.base import Observation, Policy
+from common.service import Service
+from services.actor.config import ActorSettings
+from services.actor.forwarding import ExperienceForwarder
+from services.actor.weights import PolicySwap
+
+logger = logging.getLogger(__name__)
+
+
+class Actor:
+    """Acts with the newest policy on the newest observation until the run is finished."""
+
+    def __init__(self, service: Service, spec: TaskSpec, initial: Policy, settings: ActorSettings) -> None:
+        self._service, self._spec, self._settings = service, spec, settings
+        self._rng = np.random.default_rng([service.run.seed, service.incarnation])
+        self._forwarder = ExperienceForwarder(service, settings)
+        self._swap = PolicySwap(service, spec, initial)
+        self._action_publisher = service.transport.publisher(topics.ACTION)
+        self._time_steps, self._resent = (
+            Inbox(
+                service.transport,
+                topic,
+                TimeStep,
+                service.wake,
+                service.clock,
+                service.refusals,
+                dimensions=spec.dimensions,
+                capacity=1024,
+            )
+            for topic in (topics.TIME_STEP, topics.TIME_STEP_RESENT)
+        )
+        self._stack: FrameStack[UInt8Array] | None = FrameStack(spec.frame_stack) if spec.has_camera else None
+        self._newest: tuple[int, int] = (-1, -1)
+        self._last_answer = b""
+        self._actions = 0
+        service.counters = self.counters
+        service.serve_commands({})
+
+    def run(self) -> None:
+        """Act until the bridge says that the run is finished; then see everything off to replay."""
+        service = self._service
+        self._forwarder.start()
+        self._swap.start()
+        service.state = "running"
+        try:
+            while not service.stopping.is_set() and service.finished is None:
+                with service.wake:
+                    if not (self._time_steps or self._resent):
+                        service.wake.wait(0.1)
+                self.take_time_steps()
+            self._drain()
+        finally:
+            self._swap.stop()
+            self._forwarder.stop()
+
+    def take_time_steps(self) -> None:
+        """Act on the newest TimeStep that has come; hand all of them on."""
+        arrived = sorted(self._time_steps.take() + self._resent.take(), key=lambda a: _order(a.message))
+        stack = None
+        for item in arrived:
+            stack = self._add_frames(item.message)
+        if arrived:
+            self._act_on(arrived[-1], stack)
+        for item in arrived:
+            self._forwarder.add(item.message)
+
+    def counters(self) -> dict[str, float]:
+        """Counts for the heartbeat and the record."""
+        return {"actions": self._actions, "policy_version": self._swap.policy.version, **self._forwarder.counters()}
+
+    def _add_frames(self, time_step: TimeStep) -> Stack[UInt8Array] | None:
+        if self._stack is None:
+            return None
+        try:
+            return self._stack.add(time_step, time_step.frame_ids.tolist(), list(time_step.frames))
+        except MessageError as error:
+            self._service.refusals.refuse(topics.TIME_STEP.name, error)
+            return None
+
+    def _act_on(self, newest: Arrived[TimeStep], stack: Stack[UInt8Array] | None) -> None:
+        order = _order(newest.message)
+        if order == self._newest and self._last_answer:
+            # Published again: the bridge has not seen the answer.
+            self._action_publisher.put(self._last_answer)
+        if order <= self._newest:
+            return
+        self._newest, self._last_answer = order, b""
+        if newest.message.is_last or (stack is None and self._spec.has_camera):
+            return
+        frames = np.stack(stack.frames) if stack else None
+        self._answer(newest, Observation(frames, newest.message.proprioception, newest.message.action))
+
+    def _answer(self, arrived: Arrived[TimeStep], observation: Observation) -> None:
+        time_step = arrived.message
+        if self._spec.pacing == "lockstep":
+            self._wait_for_updates()
+        policy = self._swap.policy
+        chosen = policy.act(observation, self._rng)
+        self._last_answer = encode(
+            Action(
+                actor_incarnation=self._service.incarnation,
+                incarnation=time_step.incarnation,
+                answered_seq=time_step.seq,
+                action=chosen.action,
+                log_probability=chosen.log_probability,
+                policy_version=policy.version,
+                received_ns=arrived.at_ns,
+                sent_ns=self._service.clock.now_ns(),
+            )
+        )
+        self._action_publisher.put(self._last_answer)
+        self._actions += 1
+        extras = PolicyExtras(chosen.action, chosen.log_probability, policy.version)
+        self._forwarder.remember_answer(time_step, extras)
+
+    def _wait_for_updates(self) -> None:
+        """In lockstep the world waits until the learner has spent the budget."""
+        service = self._service
+        while self._forwarder.updates_owed > self._settings.lockstep_surplus:
+            if service.stopping.is_set() or service.finished is not None:
+                return
+            with service.wake:
+                service.wake.wait(0.05)
+
+    def _drain(self) -> None:
+        finished = self._service.finished
+
+        def is_drained() -> bool:
+            return finished is None or self._forwarder.is_drained(finished.incarnation, finished.produced)
+
+        self._service.drain(is_drained, self.take_time_steps)
+
+
+def _order(time_step: TimeStep) -> tuple[int, int]:
+    """A newer bridge's TimeSteps come after an older one's."""
+    return time_step.incarnation, time_step.seq

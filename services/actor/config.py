@@ -1,0 +1,28 @@
+"""Configuration of the actor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from common.config import setting
+from common.run_settings import AlgorithmSettings, JournalSettings, RunSettings, TransportSettings
+
+
+@dataclass(frozen=True)
+class ActorSettings(JournalSettings):
+    """``[actor]``: action computation."""
+
+    threads: int = setting(1, low=1, high=64)
+    """Threads of one policy evaluation."""
+    lockstep_surplus: float = setting(2.0, low=0.0)
+    """In lockstep, the actor waits while replay has more unspent updates than this."""
+
+
+@dataclass(frozen=True)
+class ActorConfig:
+    """``actor.toml``."""
+
+    run: RunSettings
+    transport: TransportSettings
+    algorithm: AlgorithmSettings
+    actor: ActorSettings

@@ -1,0 +1,51 @@
+"""``python -m services.learner --config FILE``: updates the policy."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from pathlib import Path
+
+from common import topics
+from common.service import Service, run_service
+from services.learner.config import LearnerConfig
+
+logger = logging.getLogger(__name__)
+
+
+def serve(service: Service, config: LearnerConfig) -> None:
+    """Learn from the bridge what the task is, build the algorithm, update."""
+    settings, name = config.learner, config.algorithm.name
+    # Before torch is imported, which takes seconds of computing: not even that may delay the bridge.
+    os.nice(settings.nice)
+    from common.algorithms import load_algorithm
+    from common.algorithms.presets import resolve_config
+    from common.cpu_tuning import tune_process
+    from common.frame_ring import RING_FILE
+    from services.learner.checkpoint import restore
+    from services.learner.learner import Learner
+    from services.learner.minibatches import MappedMinibatches, MinibatchSource, ReceivedMinibatches
+
+    logger.info("%s", tune_process(settings.threads or None))
+    algorithm_class = load_algorithm(name)
+    spec = service.query_spec()
+    if spec is None:
+        return
+    preset = config.algorithm.preset or spec.algorithm_presets.get(name, "")
+    algorithm_config = resolve_config(name, preset, config.algorithm.overrides)
+    algorithm = algorithm_class(
+        spec, algorithm_config, seed=config.run.seed, device=settings.device, precision=settings.precision
+    )
+    directory = Path(config.run.directory)
+    version = restore(directory, algorithm)
+    source: MinibatchSource
+    if settings.access == "map":
+        source = MappedMinibatches(service, spec, settings.prefetch, directory / RING_FILE)
+    else:
+        source = ReceivedMinibatches(service, spec, settings.prefetch)
+    Learner(service, algorithm, algorithm_config, settings, source, version).run()
+
+
+if __name__ == "__main__":
+    sys.exit(run_service(topics.LEARNER, LearnerConfig, serve, description=__doc__))

@@ -1,0 +1,85 @@
+"""What a learner leaves on disk: the policy, and everything the next update depends on. Never pickle."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from common.algorithms.base import Algorithm, Arrays
+from common.codec import encode
+from common.errors import ConfigError
+from common.messages import PolicyWeights
+
+logger = logging.getLogger(__name__)
+
+POLICY_FILE, CHECKPOINT_FILE = "policy.msgpack", "checkpoint.npz"
+_VERSION_KEY = "policy_version"
+
+
+class CheckpointWriter:
+    """Writes the newest checkpoint on a thread of its own; one that comes while another is written replaces it."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._wake = threading.Condition()
+        self._pending: tuple[PolicyWeights, Arrays] | None = None
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="checkpoint", daemon=True)
+        self._thread.start()
+
+    def write(self, weights: PolicyWeights, state: Arrays) -> None:
+        """Take over a checkpoint to write."""
+        with self._wake:
+            self._pending = (weights, state)
+            self._wake.notify()
+
+    def close(self) -> None:
+        """Write what is pending, then stop."""
+        with self._wake:
+            self._stopping = True
+            self._wake.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                while self._pending is None and not self._stopping:
+                    self._wake.wait()
+                pending, self._pending = self._pending, None
+            if pending is None:
+                return
+            weights, state = pending
+            try:
+                _replace(self._directory / POLICY_FILE, encode(weights))
+                buffer = io.BytesIO()
+                np.savez(buffer, **{_VERSION_KEY: np.int64(weights.version)}, **state)  # type: ignore[arg-type]
+                _replace(self._directory / CHECKPOINT_FILE, buffer.getvalue())
+            except OSError as error:
+                logger.error("%s: the checkpoint cannot be written: %s", self._directory, error)
+
+
+def restore(directory: Path, algorithm: Algorithm) -> int:
+    """Continue from the run's checkpoint if there is one; return the policy version it had reached, else 0."""
+    path = directory / CHECKPOINT_FILE
+    if not path.exists():
+        return 0
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            state = dict(file)
+        version = int(state.pop(_VERSION_KEY))
+        algorithm.load_state_dict(state)
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise ConfigError(f"{path}: cannot go on from this checkpoint: {error}; remove it to begin anew") from error
+    logger.info("going on from update %d, policy version %d", algorithm.updates, version)
+    return version
+
+
+def _replace(path: Path, content: bytes) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_bytes(content)
+    temporary.replace(path)

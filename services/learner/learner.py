@@ -1,0 +1,154 @@
+"""The learner: updates the policy from minibatches and pushes it to the actor, as fast as the budget allows."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from pathlib import Path
+
+from common import topics
+from common.algorithms.base import Algorithm
+from common.algorithms.presets import SACConfig
+from common.codec import encode
+from common.messages import PolicyWeights
+from common.minibatch import Minibatch
+from common.service import Service
+from services.learner.checkpoint import CheckpointWriter
+from services.learner.config import LearnerSettings
+from services.learner.minibatches import MinibatchSource
+
+logger = logging.getLogger(__name__)
+
+METRICS_S = 1.0
+"""Period in which losses are read off the algorithm."""
+
+
+class PolicyPusher:
+    """Publishes policies on a thread of its own: a slow link delays the next push, never an update.
+
+    While one is on its way, the next ones replace each other: only the newest is worth sending.
+    """
+
+    def __init__(self, service: Service) -> None:
+        self._publisher = service.transport.publisher(topics.POLICY)
+        self._wake = threading.Condition()
+        self._pending: PolicyWeights | None = None
+        self._stopping = False
+        self.pushes = 0
+        self.skipped = 0
+        """Policies replaced by a newer one before they were sent."""
+        self._thread = threading.Thread(target=self._run, name="policy push", daemon=True)
+        self._thread.start()
+
+    def push(self, weights: PolicyWeights) -> None:
+        """Send ``weights`` as soon as the one before is gone."""
+        with self._wake:
+            self.skipped += self._pending is not None
+            self._pending = weights
+            self._wake.notify()
+
+    def close(self) -> None:
+        """Stop; what is pending is not sent. A push that is stuck in a dead link ends with the session."""
+        with self._wake:
+            self._stopping = True
+            self._wake.notify()
+        self._thread.join(0.2)
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                while self._pending is None and not self._stopping:
+                    self._wake.wait()
+                if self._stopping or self._pending is None:
+                    return
+                weights, self._pending = self._pending, None
+            self._publisher.put(encode(weights))
+            self.pushes += 1
+
+
+class Learner:
+    """Runs the algorithm until the run is finished, then saves."""
+
+    def __init__(
+        self,
+        service: Service,
+        algorithm: Algorithm,
+        config: SACConfig,
+        settings: LearnerSettings,
+        source: MinibatchSource,
+        policy_version: int,
+    ) -> None:
+        self._service, self._algorithm, self._config = service, algorithm, config
+        self._source = source
+        self._pusher = PolicyPusher(service)
+        self._checkpoints = CheckpointWriter(Path(service.run.directory))
+        self._checkpoint_ns = round(settings.checkpoint_s * 1e9)
+        self._policy_version = policy_version
+        self._metrics: dict[str, float] = {}
+        self._rate = 0.0
+        self._checkpoint_asked = threading.Event()
+        service.counters = self.counters
+        service.serve_commands({"checkpoint": self._ask_checkpoint})
+
+    def run(self) -> None:
+        """Update until the bridge says that the run is finished; then save."""
+        service, clock = self._service, self._service.clock
+        self._source.start()
+        service.state = "running"
+        if self._policy_version:
+            self._push()
+        next_checkpoint_ns = clock.now_ns() + self._checkpoint_ns
+        measured_ns, measured_updates = clock.now_ns(), self._algorithm.updates
+        try:
+            while not service.stopping.is_set() and service.finished is None:
+                minibatch = self._source.get(timeout_s=0.1)
+                if minibatch is not None:
+                    self._update(minibatch)
+                now_ns = clock.now_ns()
+                if now_ns - measured_ns >= METRICS_S * 1e9:
+                    self._rate = (self._algorithm.updates - measured_updates) / (now_ns - measured_ns) * 1e9
+                    measured_ns, measured_updates = now_ns, self._algorithm.updates
+                    self._metrics = self._algorithm.metrics()
+                if now_ns >= next_checkpoint_ns or self._checkpoint_asked.is_set():
+                    self._checkpoint_asked.clear()
+                    next_checkpoint_ns = now_ns + self._checkpoint_ns
+                    self._save()
+            self._source.stop()
+            self._save()
+            service.drain(lambda: True, lambda: None)
+        finally:
+            self._pusher.close()
+            self._checkpoints.close()
+
+    def counters(self) -> dict[str, float]:
+        """Counts and losses for the heartbeat and the record."""
+        return {
+            "updates": self._algorithm.updates,
+            "updates_per_s": self._rate,
+            "policy_version": self._policy_version,
+            "policy_pushes": self._pusher.pushes,
+            "pushes_skipped": self._pusher.skipped,
+            "minibatches_dropped": self._source.dropped,
+            **self._metrics,
+        }
+
+    def _update(self, minibatch: Minibatch) -> None:
+        self._algorithm.update(minibatch)
+        if self._algorithm.updates % self._config.policy_push_interval == 0:
+            self._push()
+
+    def _push(self) -> None:
+        # A learner without its predecessor's last version must not fall behind what the actor already has.
+        known = int(self._service.peer_counter(topics.ACTOR, "policy_version"))
+        self._policy_version = max(self._policy_version, known) + 1
+        self._pusher.push(self._weights())
+
+    def _weights(self) -> PolicyWeights:
+        return self._algorithm.policy_weights(max(1, self._policy_version), self._config.weights_dtype)
+
+    def _save(self) -> None:
+        self._checkpoints.write(self._weights(), self._algorithm.state_dict())
+
+    def _ask_checkpoint(self) -> str:
+        self._checkpoint_asked.set()
+        return "a checkpoint will be written after the running update"

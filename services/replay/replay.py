@@ -1,0 +1,194 @@
+"""Replay: keeps experience in the ring, acknowledges what is kept, and gives out minibatches on credit.
+
+::
+
+    Experience ─▶ in order, once ─▶ ring ─▶ Acknowledgement
+                                     │
+                     Credit ─▶ budget ─▶ Minibatch
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common import topics
+from common.algorithms.presets import SACConfig
+from common.codec import encode
+from common.errors import MessageError
+from common.frame_ring import RING_FILE, RingWriter, array_minibatch
+from common.inbox import Inbox
+from common.journal import OrderedReceiver
+from common.messages import Credit, Experience, RowMinibatch, StreamHead, TaskSpec
+from common.service import Service
+from services.replay.config import ReplaySettings
+from services.replay.sampler import TransitionSampler, UpdateBudget
+
+logger = logging.getLogger(__name__)
+
+ACKNOWLEDGE_S = 0.1
+"""Period of the acknowledgement to the actor."""
+LOST_AFTER_NS = 1_000_000_000
+"""A minibatch that the learner still misses after this long is taken for lost on the way."""
+
+
+class Replay:
+    """Owns the experience ring; the only one who writes it."""
+
+    def __init__(self, service: Service, spec: TaskSpec, algorithm: SACConfig, settings: ReplaySettings) -> None:
+        self._service, self._settings, self._batch_size = service, settings, algorithm.batch_size
+        self._ring = RingWriter.create_or_reopen(
+            Path(service.run.directory) / RING_FILE, spec, algorithm.replay_capacity, settings.frames_per_row
+        )
+        self._persisted = self._ring.persisted_counts()
+        self._transitions = self._ring.transitions_appended
+        self._budget = UpdateBudget(
+            algorithm.replay_ratio, algorithm.min_size_to_sample, settings.max_surplus, self._transitions
+        )
+        self._sampler = TransitionSampler(np.random.default_rng([service.run.seed, service.incarnation]))
+        self._receiver: OrderedReceiver[Experience] = OrderedReceiver()
+        self._experiences = [
+            self._inbox(topic, Experience, dimensions=spec.dimensions, capacity=1024)
+            for topic in (topics.EXPERIENCE, topics.EXPERIENCE_RESENT)
+        ]
+        self._heads = self._inbox(topics.EXPERIENCE_HEAD, StreamHead)
+        self._credits = self._inbox(topics.CREDIT, Credit)
+        self._ack_publisher = service.transport.publisher(topics.EXPERIENCE_ACK)
+        self._next_ack_ns = 0
+        self._maps = settings.access == "map"
+        self._minibatches = service.transport.publisher(topics.ROW_MINIBATCH if self._maps else topics.ARRAY_MINIBATCH)
+        self._credit = Credit(0, 0, 0)
+        self._sent = 0
+        self._sent_ns = 0
+        self._sent_total = 0
+        self._produced_seen: dict[int, int] = {}
+        self._copies_refused = 0
+        if self._ring.rows_appended:
+            logger.info("the ring already holds %d experiences: going on", self._ring.rows_appended)
+        service.counters = self.counters
+        service.details = self.details
+        service.serve_commands({})
+
+    def run(self) -> None:
+        """Serve actor and learner until the run is finished and nothing is on its way any more."""
+        service = self._service
+        service.state = "running"
+        try:
+            while not service.stopping.is_set() and service.finished is None:
+                with service.wake:
+                    if not self._has_work():
+                        service.wake.wait(ACKNOWLEDGE_S)
+                self.step()
+            service.drain(self._is_drained, self._store)
+        finally:
+            self._ring.close()
+
+    def step(self) -> None:
+        """Handle all that has come."""
+        self._store()
+        self._serve_credit()
+
+    def counters(self) -> dict[str, float]:
+        """Counts for the heartbeat and the record."""
+        return {
+            "rows": sum(list(self._persisted.values())),
+            "transitions": self._transitions,
+            "minibatches": self._sent_total,
+            "owed": self._budget.owed,
+            "lost": self._receiver.lost,
+            "duplicates": self._receiver.duplicates + self._copies_refused,
+        }
+
+    def details(self) -> dict[str, Any]:
+        """What of each bridge incarnation's TimeSteps has been persisted, and what is known to have existed."""
+        return {
+            "persisted": {str(name): count for name, count in list(self._persisted.items())},
+            "produced_seen": {str(name): count for name, count in list(self._produced_seen.items())},
+        }
+
+    def _inbox(self, topic: topics.Topic, expected: Any, **options: Any) -> Inbox[Any]:
+        service = self._service
+        return Inbox(service.transport, topic, expected, service.wake, service.clock, service.refusals, **options)
+
+    def _has_work(self) -> bool:
+        return any([*self._experiences, self._heads, self._credits])
+
+    # ------------------------------------------------------------------ experience
+
+    def _store(self) -> None:
+        for inbox in self._experiences:
+            for experience, _ in inbox.take():
+                self._receiver.accept(experience.actor_incarnation, experience.seq, experience)
+        for head, _ in self._heads.take():
+            self._receiver.note_head(head)
+        for experience in self._receiver.take_ready():
+            self._append(experience)
+        now_ns = self._service.clock.now_ns()
+        if now_ns >= self._next_ack_ns and (ack := self._receiver.acknowledgement(self._budget.owed)):
+            self._next_ack_ns = now_ns + round(ACKNOWLEDGE_S * 1e9)
+            self._ack_publisher.put(encode(ack))
+
+    def _append(self, experience: Experience) -> None:
+        step = experience.time_step
+        seen = self._produced_seen.get(step.incarnation, 0)
+        self._produced_seen[step.incarnation] = max(seen, step.seq + 1)
+        if self._ring.contains(step.incarnation, step.seq):
+            # A restarted actor sends again what its predecessor had sent and not yet told the bridge.
+            self._copies_refused += 1
+            return
+        try:
+            self._ring.append(experience)
+        except MessageError as error:
+            self._service.refusals.refuse(topics.EXPERIENCE.name, error)
+            return
+        self._persisted[step.incarnation] = self._persisted.get(step.incarnation, 0) + 1
+        transitions = self._ring.transitions_appended
+        self._budget.add(transitions - self._transitions)
+        self._transitions = transitions
+
+    # ------------------------------------------------------------------ minibatches
+
+    def _serve_credit(self) -> None:
+        if arrived := self._credits.take_newest():
+            self._take_credit(arrived.message)
+        while self._sent < self._credit.want_total and self._budget.spend():
+            if not self._send_minibatch():
+                return
+
+    def _take_credit(self, credit: Credit) -> None:
+        if credit.learner_incarnation < self._credit.learner_incarnation:
+            return
+        if credit.learner_incarnation > self._credit.learner_incarnation:
+            logger.info("a learner has joined")
+            self._sent = credit.received_total
+        elif credit.received_total < self._sent and self._service.clock.now_ns() - self._sent_ns > LOST_AFTER_NS:
+            self._sent = credit.received_total
+        self._credit = credit
+
+    def _send_minibatch(self) -> bool:
+        rows = self._sampler.sample(self._ring, self._batch_size)
+        if rows is None:
+            return False
+        learner = self._credit.learner_incarnation
+        if self._maps:
+            self._minibatches.put(encode(RowMinibatch(learner, self._sent, rows)))
+        else:
+            for part in array_minibatch(self._ring, rows, learner, self._sent, int(self._settings.message_mib * 2**20)):
+                self._minibatches.put(encode(part))
+        self._sent += 1
+        self._sent_total += 1
+        self._sent_ns = self._service.clock.now_ns()
+        return True
+
+    def _is_drained(self) -> bool:
+        finished = self._service.finished
+        if finished is None:
+            return True
+        if self._persisted.get(finished.incarnation, 0) >= finished.produced:
+            return True
+        # Something is missing that will not come: the actor has nothing more, or is gone.
+        actor = self._service.peer_state(topics.ACTOR)
+        return actor in ("drained", "stopped", "gone") and self._receiver.received_all

@@ -1,0 +1,51 @@
+"""``python -m services.robot_bridge --config FILE``: tethered to the robot, runs its action cycle."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from common import topics
+from common.record import read_parts
+from common.service import Service, run_service
+from services.robot_bridge.bookkeeping import Totals
+from services.robot_bridge.bridge import RobotBridge
+from services.robot_bridge.config import RobotBridgeConfig
+from services.robot_bridge.tasks import load_task
+
+logger = logging.getLogger(__name__)
+
+
+def serve(service: Service, config: RobotBridgeConfig) -> None:
+    """Build the task and run the bridge."""
+    settings = config.robot_bridge
+    totals = _earlier_totals(Path(config.run.directory))
+    task = load_task(
+        config.task.name,
+        config.task.preset,
+        config.task.overrides,
+        config.tasks.rows,
+        pacing=settings.pacing,
+        # A restarted bridge must not repeat the starts of the one before.
+        rng=np.random.default_rng([config.run.seed, totals.attempts]),
+    )
+    RobotBridge(service, task, settings, totals).run()
+
+
+def _earlier_totals(directory: Path) -> Totals:
+    """Where the last incarnation of this run's bridge was when it last wrote; at most a second is counted again."""
+    parts = read_parts(directory, topics.ROBOT_BRIDGE)
+    if not parts:
+        return Totals()
+    counters = parts[-1].get("counters", {})
+    names = ("steps", "acted_steps", "episodes", "attempts")
+    totals = Totals(**{name: int(counters.get(name, 0)) for name in names})
+    logger.warning("this run has had a robot_bridge before: going on from step %d", totals.steps)
+    return totals
+
+
+if __name__ == "__main__":
+    sys.exit(run_service(topics.ROBOT_BRIDGE, RobotBridgeConfig, serve, description=__doc__))

@@ -1,0 +1,457 @@
+"""The robot bridge: sensors, actuators, reward and reset, in action cycles.
+
+One cycle, in real time::
+
+    publish TimeStep t ─▶ apply the action that answers it, on arrival ─▶ deadline: the world has gone on meanwhile
+        ▲                                                                     │
+        └──── observe, judge, count; record the command in force at the end ◀─┘
+
+Nothing in it waits for the network, the disk or a lock that someone slow can hold. In lockstep the deadline is the
+answer, and the world's time moves by one cycle per step.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from common import topics
+from common.clock import CycleKeeper
+from common.codec import encode
+from common.errors import ServiceError
+from common.inbox import Arrived, Inbox
+from common.journal import JournalSender
+from common.messages import Action, ActionSource, Finished, Float32Array, TimeStep
+from common.service import Service
+from services.robot_bridge.bookkeeping import EpisodeResult, Ledger, Totals
+from services.robot_bridge.config import RobotBridgeSettings
+from services.robot_bridge.tasks.base import Task
+from services.robot_bridge.watchdog import Watchdog
+
+logger = logging.getLogger(__name__)
+
+WARM_UP_CYCLES = 1000
+"""``overruns_after_1000`` counts from here."""
+REPUBLISH_NS = 1_000_000_000
+"""In lockstep, a TimeStep is published again after this long without an answer."""
+REMEMBERED_STEPS = 256
+"""An action that answers an older TimeStep than this is not even counted as late."""
+PEERS = (topics.ACTOR, topics.REPLAY)
+"""Without these no attempt starts: nobody would act, or nothing would be kept."""
+
+
+@dataclass(frozen=True)
+class CommandInForce:
+    """The robot's command and where it came from."""
+
+    action: Float32Array
+    source: ActionSource
+    answered_seq: int
+    applied_ns: int
+
+
+@dataclass
+class PublishedStep:
+    """When a TimeStep was published, and when the cycle that it began ended."""
+
+    published_ns: int
+    end_ns: int | None = None
+
+
+@dataclass
+class CycleCounts:
+    """Counts of this incarnation."""
+
+    cycles: int = 0
+    overruns: int = 0
+    overruns_after_1000: int = 0
+    skipped_cycles: int = 0
+    late_actions: int = 0
+    unanswered: int = 0
+    refused_actions: int = 0
+    produced: int = 0
+
+
+class RobotBridge:
+    """Runs a task's action cycle against the actor's answers until the run's steps are done."""
+
+    def __init__(self, service: Service, task: Task, settings: RobotBridgeSettings, totals: Totals) -> None:
+        self._service, self._task, self._settings = service, task, settings
+        self._clock, self._spec = service.clock, task.spec
+        self._realtime = settings.pacing == "realtime"
+        self._cycle_ns = round(self._spec.action_cycle_time_s * 1e9)
+        self._keeper = CycleKeeper(self._cycle_ns)
+        self._watchdog = Watchdog(round(settings.stop_after * 1e9))
+        self._ledger = Ledger(self._spec, totals)
+        self._journal = JournalSender(
+            service.transport,
+            service.incarnation,
+            settings,
+            topic=topics.TIME_STEP,
+            resent=topics.TIME_STEP_RESENT,
+            head=topics.TIME_STEP_HEAD,
+            acknowledgement=topics.TIME_STEP_ACK,
+            clock=self._clock,
+        )
+        self._actions = Inbox(
+            service.transport,
+            topics.ACTION,
+            Action,
+            service.wake,
+            self._clock,
+            service.refusals,
+            dimensions=self._spec.dimensions,
+            capacity=16,
+        )
+        self._finished_publisher = service.transport.publisher(topics.FINISHED)
+        self.counts = CycleCounts()
+        self._last_return: float | None = None
+        self._engaged = False
+        self._needs_new_goal = True
+        self._actor_incarnation = 0
+        self._attempt_first_seq = 0
+        self._published: dict[int, PublishedStep] = {}
+        self._in_force = self._no_command()
+        self._world_ns = self._clock.now_ns()
+        self._payload = b""
+        service.counters = self.counters
+        service.details = self.details
+        service.serve_commands(
+            {"pause": lambda: self._latch("pause"), "e_stop": lambda: self._latch("e_stop"), "resume": self._resume}
+        )
+        service.transport.serve(topics.SPEC, lambda _: encode(self._spec))
+
+    def run(self) -> None:
+        """Act until the run's steps are done or the service is asked to stop; then hand over what is on its way."""
+        self._journal.start()
+        self._service.state = "running"
+        self._task.advance_to(self._world_ns)
+        try:
+            while not self._over():
+                if not self._ready():
+                    self._engage()
+                    continue
+                self._run_attempt()
+        finally:
+            self._task.close()
+        self._finish("stopped" if self._service.stopping.is_set() else "steps")
+        self._journal.stop()
+
+    # ------------------------------------------------------------------ attempts
+
+    def _run_attempt(self) -> None:
+        self._begin_attempt()
+        terminated = truncated = False
+        while not (terminated or truncated or self._over()):
+            if not self._wait_for_cycle_end():
+                return
+            terminated, truncated = self._end_cycle()
+        if truncated:
+            self._reset()
+
+    def _begin_attempt(self) -> None:
+        if self._needs_new_goal:
+            self._task.begin_episode()
+            self._needs_new_goal = False
+        else:
+            self._task.begin_attempt()
+        self._ledger.begin_attempt()
+        self._attempt_first_seq = self.counts.produced
+        self._in_force = self._no_command()
+        self._watchdog.restart(self._clock.now_ns())
+        self._observe(reward=0.0, terminated=False, truncated=False)
+
+    def _end_cycle(self) -> tuple[bool, bool]:
+        """Judge the cycle that ends now and publish what it led to; return whether the attempt has ended, and how."""
+        self._advance_world()
+        self._published[self.counts.produced - 1].end_ns = self._clock.now_ns()
+        answered = self._in_force.source is ActionSource.POLICY
+        self.counts.unanswered += not answered
+        outcome = self._task.outcome()
+        truncated, episode = self._ledger.end_cycle(outcome.reward, outcome.terminated)
+        self._observe(outcome.reward, outcome.terminated, truncated)
+        if answered:
+            self._in_force = replace(self._in_force, source=ActionSource.HELD)
+        elif self._settings.on_missing_action == "zero" and self._in_force.source is ActionSource.HELD:
+            self._command(np.zeros_like(self._in_force.action), ActionSource.ZERO, -1)
+        if episode:
+            self._record_episode(episode)
+        self._needs_new_goal = outcome.terminated or episode is not None
+        return outcome.terminated, truncated
+
+    def _reset(self) -> None:
+        """Let the reset of a time-out take its time; actions that come meanwhile answer what is over."""
+        self._attempt_first_seq = self.counts.produced
+        self._task.stop()
+        for _ in range(self._spec.reset_steps):
+            if self._over():
+                return
+            if self._realtime:
+                while not self._service.stopping.is_set() and self._clock.now_ns() < self._keeper.deadline_ns:
+                    self._sleep_until(self._keeper.deadline_ns)
+                    self._take_actions()
+                self._count_cycle()
+            self._advance_world()
+            self._ledger.end_reset_cycle()
+
+    # ------------------------------------------------------------------ one cycle
+
+    def _wait_for_cycle_end(self) -> bool:
+        """Apply actions as they come until the cycle is over; False if the run is to stop."""
+        ended = self._wait_for_deadline() if self._realtime else self._wait_for_answer()
+        if ended:
+            self._count_cycle()
+        return ended
+
+    def _wait_for_deadline(self) -> bool:
+        while True:
+            self._take_actions()
+            now_ns = self._clock.now_ns()
+            if self._watchdog.expire(now_ns):
+                logger.warning("no fresh action for %.2f s: the robot is stopped", self._settings.stop_after)
+                self._stop_robot()
+            if self._service.stopping.is_set():
+                return False
+            if now_ns >= self._keeper.deadline_ns and not self._waits_longer(now_ns):
+                return True
+            limits = [self._keeper.deadline_ns] if now_ns < self._keeper.deadline_ns else []
+            if not self._watchdog.stopped:
+                limits.append(self._watchdog.deadline_ns)
+            self._sleep_until(min(limits))
+
+    def _waits_longer(self, now_ns: int) -> bool:
+        """With ``wait``, the cycle lasts until its action has come; the watchdog is the limit."""
+        answered = self._in_force.source is ActionSource.POLICY
+        if self._settings.on_missing_action != "wait" or answered or self._watchdog.stopped:
+            return False
+        self._keeper.stretch(now_ns)
+        return True
+
+    def _wait_for_answer(self) -> bool:
+        published_ns = self._clock.now_ns()
+        while self._in_force.answered_seq != self.counts.produced - 1:
+            if self._service.stopping.is_set():
+                return False
+            self._sleep_until(published_ns + REPUBLISH_NS)
+            self._take_actions()
+            if self._clock.now_ns() - published_ns >= REPUBLISH_NS:
+                published_ns = self._clock.now_ns()
+                self._journal.republish(self._payload)
+        return True
+
+    def _sleep_until(self, deadline_ns: int) -> None:
+        with self._service.wake:
+            if not self._actions and not self._service.stopping.is_set():
+                self._clock.wait_until(deadline_ns, self._service.wake)
+
+    def _count_cycle(self) -> None:
+        counts = self.counts
+        counts.cycles += 1
+        if not self._realtime:
+            self._world_ns += self._cycle_ns
+            return
+        lateness = self._keeper.next(self._clock.now_ns())
+        if lateness.overrun:
+            counts.overruns += 1
+            counts.overruns_after_1000 += counts.cycles > WARM_UP_CYCLES
+            counts.skipped_cycles += lateness.skipped
+            if lateness.skipped:
+                logger.warning("an action cycle ended %.0f ms late", lateness.late_ns / 1e6)
+
+    def _advance_world(self) -> None:
+        """The world has gone on until now; in lockstep, `now` is counted in cycles."""
+        if self._realtime:
+            self._world_ns = self._clock.now_ns()
+        self._task.advance_to(self._world_ns)
+
+    # ------------------------------------------------------------------ actions
+
+    def _take_actions(self) -> None:
+        if self._watchdog.latched and self._in_force.source is not ActionSource.STOP:
+            self._stop_robot()
+        for arrived in self._actions.take():
+            if self._is_wanted(arrived):
+                self._apply(arrived)
+            else:
+                self.counts.refused_actions += 1
+
+    def _is_wanted(self, arrived: Arrived[Action]) -> bool:
+        """Count and record an action that answers this attempt; True if it is to be applied."""
+        action = arrived.message
+        step = self._published.get(action.answered_seq)
+        if action.incarnation != self._service.incarnation or step is None:
+            return False  # An earlier bridge's, or too old to tell anything.
+        if action.actor_incarnation < self._actor_incarnation:
+            return False
+        self._actor_incarnation = action.actor_incarnation
+        late = step.end_ns is not None and arrived.at_ns > step.end_ns
+        self.counts.late_actions += late
+        self._service.record.row(
+            "actions",
+            {
+                "incarnation": action.incarnation,
+                "answered_seq": action.answered_seq,
+                "published_ns": step.published_ns,
+                "arrived_ns": arrived.at_ns,
+                "late": int(late),
+            },
+        )
+        newest_answered = max(self._in_force.answered_seq, self._attempt_first_seq - 1)
+        if action.answered_seq <= newest_answered:
+            return False
+        return not self._realtime or self._watchdog.accept(step.published_ns, arrived.at_ns)
+
+    def _apply(self, arrived: Arrived[Action]) -> None:
+        self._engaged = True
+        clipped = np.clip(arrived.message.action, self._spec.action_low, self._spec.action_high)
+        self._command(clipped, ActionSource.POLICY, arrived.message.answered_seq)
+
+    def _command(self, action: Float32Array, source: ActionSource, answered_seq: int) -> None:
+        self._advance_world()
+        self._task.command(action)
+        self._in_force = CommandInForce(action, source, answered_seq, self._clock.now_ns())
+
+    def _stop_robot(self) -> None:
+        self._advance_world()
+        self._task.stop()
+        # The number of the last answer stays: what it answers must not be applied again.
+        self._in_force = replace(self._no_command(), source=ActionSource.STOP, answered_seq=self._in_force.answered_seq)
+
+    def _no_command(self) -> CommandInForce:
+        zeros = np.zeros(len(self._spec.action_low), np.float32)
+        return CommandInForce(zeros, ActionSource.ZERO, -1, self._clock.now_ns())
+
+    # ------------------------------------------------------------------ observations
+
+    def _observe(self, reward: float, terminated: bool, truncated: bool) -> None:
+        reading = self._task.read()
+        if not (np.isfinite(reading.proprioception).all() and np.isfinite(reward)):
+            raise ServiceError(f"a sensor gave {reading.proprioception}, reward {reward}: expected finite numbers")
+        first = self._ledger.step_index == 0
+        command, totals, now_ns = self._in_force, self._ledger.totals, self._clock.now_ns()
+        by_actor = command.source in (ActionSource.POLICY, ActionSource.HELD) and not first
+        time_step = TimeStep(
+            incarnation=self._service.incarnation,
+            seq=self.counts.produced,
+            episode=self._ledger.episode,
+            attempt=self._ledger.attempt,
+            step_index=self._ledger.step_index,
+            published_ns=now_ns,
+            frame_ids=reading.frame_ids,
+            frame_capture_ns=reading.frame_capture_ns,
+            frames=reading.frames,
+            proprioception=reading.proprioception,
+            action=command.action,
+            action_source=ActionSource.NONE if first else command.source,
+            answered_seq=command.answered_seq if by_actor else -1,
+            action_applied_ns=0 if first else command.applied_ns,
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            steps=totals.steps,
+            acted_steps=totals.acted_steps,
+        )
+        if not time_step.is_last:
+            self._published[time_step.seq] = PublishedStep(now_ns)
+            self._published.pop(time_step.seq - REMEMBERED_STEPS, None)
+        self._payload = encode(time_step)
+        self.counts.produced += 1
+        self._journal.put(time_step.seq, self._payload)
+
+    # ------------------------------------------------------------------ beginning and end
+
+    def _over(self) -> bool:
+        return self._service.stopping.is_set() or self._ledger.totals.steps >= self._settings.steps
+
+    def _ready(self) -> bool:
+        """True while an attempt may start: actor and replay are there and an answer has come."""
+        if self._watchdog.latched or any(self._service.peer_age_s(p) > self._settings.peer_grace for p in PEERS):
+            self._engaged = False
+        return self._engaged
+
+    def _engage(self) -> None:
+        """Wait for actor and replay, then publish one observation; its answer shows that the ring is closed."""
+        self._task.stop()
+        waiting = [peer for peer in PEERS if self._service.peer_state(peer) not in ("running", "draining")]
+        if waiting or self._watchdog.latched:
+            self._service.stopping.wait(0.05)
+            return
+        logger.info("actor and replay are there: asking for a first answer")
+        # The probe is an attempt of a single TimeStep: no transition comes of it, and no step is counted.
+        self._begin_attempt()
+        asked_ns = self._clock.now_ns()
+        while not self._engaged and self._clock.now_ns() - asked_ns < self._settings.stop_after * 1e9:
+            if self._service.stopping.is_set():
+                return
+            self._sleep_until(asked_ns + round(self._settings.stop_after * 1e9))
+            self._take_actions()
+        self._task.stop()
+        self._keeper.start(self._clock.now_ns())
+
+    def _finish(self, reason: str) -> None:
+        finished = encode(Finished(self._service.incarnation, self.counts.produced, reason))
+        sent_ns = 0
+        logger.info("finished (%s): %d steps, %d episodes", reason, *list(asdict(self._ledger.totals).values())[::2])
+
+        def work() -> None:
+            nonlocal sent_ns
+            if self._clock.now_ns() - sent_ns > 0.2e9:
+                sent_ns = self._clock.now_ns()
+                self._finished_publisher.put(finished)
+
+        self._service.drain(lambda: self._journal.unacknowledged == 0, work)
+
+    def _record_episode(self, episode: EpisodeResult) -> None:
+        self._last_return = episode.undiscounted_return
+        self._service.record.row(
+            "episodes",
+            {
+                "episode": episode.episode,
+                "return": episode.undiscounted_return,
+                "length": episode.length,
+                "attempts": episode.attempts,
+                "steps": episode.steps,
+                "acted_steps": episode.acted_steps,
+                "experience_time_s": round(episode.steps * self._spec.action_cycle_time_s, 3),
+            },
+        )
+
+    # ------------------------------------------------------------------ commands and counts
+
+    # Commands come on a receiving thread: they only set the latch, the cycle's thread moves the robot.
+
+    def _latch(self, reason: str) -> str:
+        self._watchdog.latch(reason)
+        with self._service.wake:
+            self._service.wake.notify_all()
+        return f"{reason}: the robot stops; `resume` lets it go on"
+
+    def _resume(self) -> str:
+        self._watchdog.release(self._clock.now_ns())
+        return "resumed"
+
+    def counters(self) -> dict[str, float]:
+        """Counts and gauges for the heartbeat and the record."""
+        return {
+            **asdict(self._ledger.totals),
+            **asdict(self.counts),
+            "resent": self._journal.resent,
+            "unacknowledged": self._journal.unacknowledged,
+            "given_up": self._journal.given_up,
+            "stops": self._watchdog.stops,
+            **({} if self._last_return is None else {"last_return": self._last_return}),
+        }
+
+    def details(self) -> dict[str, Any]:
+        """What else the summary needs to know."""
+        return {
+            "task": self._spec.task,
+            "preset": self._spec.preset,
+            "pacing": self._spec.pacing,
+            "has_goal": self._spec.has_goal,
+            "seed": self._service.run.seed,
+            "steps_total": self._settings.steps,
+        }

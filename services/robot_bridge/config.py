@@ -1,0 +1,54 @@
+"""Configuration of the robot bridge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from common.config import setting
+from common.run_settings import JournalSettings, RunSettings, TransportSettings
+
+
+@dataclass(frozen=True)
+class TaskSettings:
+    """``[task]``: what is to be learnt. Other keys of the section override the task's own settings."""
+
+    name: str = setting()
+    """Task id, a key of the task table."""
+    preset: str = setting("")
+    """Task preset; empty takes the task's default."""
+    overrides: dict[str, Any] = setting(rest=True)
+
+
+@dataclass(frozen=True)
+class TaskTable:
+    """``[tasks]``: more rows for the task table, ``id = "module:Class"``."""
+
+    rows: dict[str, Any] = setting(rest=True)
+
+
+@dataclass(frozen=True)
+class RobotBridgeSettings(JournalSettings):
+    """``[robot_bridge]``: the action cycle."""
+
+    steps: int = setting(7000, low=1)
+    """Action cycles of the run, resets included; then the bridge says that the run is finished."""
+    pacing: str = setting("realtime", choices=("realtime", "lockstep"))
+    """``realtime``: cycles follow the clock. ``lockstep``: each cycle waits for its action, the world with it."""
+    on_missing_action: str = setting("hold", choices=("hold", "zero", "wait"))
+    """At the end of a cycle without an action: ``hold`` the last command, command ``zero``, or ``wait`` for it."""
+    stop_after: float = setting(0.5, low=0.01, high=60.0)
+    """The watchdog stops the robot after this long without a fresh action, seconds."""
+    peer_grace: float = setting(5.0, low=0.1, high=3600.0)
+    """No attempt starts when actor or replay has not been heard of for this long, seconds."""
+
+
+@dataclass(frozen=True)
+class RobotBridgeConfig:
+    """``robot_bridge.toml``."""
+
+    run: RunSettings
+    transport: TransportSettings
+    task: TaskSettings
+    tasks: TaskTable
+    robot_bridge: RobotBridgeSettings

@@ -1,0 +1,66 @@
+"""The table of tasks. A new task is one file and one line here, or a ``[tasks]`` row in the bridge's configuration."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from common.config import build_section
+from common.errors import ConfigError
+from services.robot_bridge.tasks.base import Outcome, SensorReading, Task
+
+TASKS = {
+    "dot_reacher": "services.robot_bridge.tasks.dot_reacher:DotReacher",
+    "visual_dot_reacher": "services.robot_bridge.tasks.visual_dot_reacher:VisualDotReacher",
+    "noise_frames": "services.robot_bridge.tasks.noise_frames:NoiseFrames",
+}
+"""Task id -> ``module:Class``; imported only when chosen, so that a robot's driver burdens no one else."""
+
+__all__ = ["TASKS", "Outcome", "SensorReading", "Task", "load_task"]
+
+
+def load_task(
+    name: str,
+    preset: str = "",
+    overrides: Mapping[str, Any] | None = None,
+    rows: Mapping[str, Any] | None = None,
+    *,
+    pacing: str = "lockstep",
+    rng: np.random.Generator,
+) -> Task:
+    """Build task ``name``.
+
+    Args:
+        name: task id.
+        preset: one of the task's presets; empty takes its default.
+        overrides: settings that win over the preset's.
+        rows: more rows for the table.
+        pacing: ``realtime`` or ``lockstep``, told to others through the TaskSpec.
+        rng: all of the task's randomness.
+
+    Raises:
+        ConfigError: unknown task, preset or setting, or a value out of range.
+    """
+    task_class = _load_class(name, {**TASKS, **(rows or {})})
+    preset = preset or next(iter(task_class.PRESETS))
+    if preset not in task_class.PRESETS:
+        raise ConfigError(f"[task] preset = {preset!r}: task {name} has the presets {', '.join(task_class.PRESETS)}")
+    values = {**task_class.PRESETS[preset], **(overrides or {})}
+    settings = build_section(task_class.SETTINGS, values, f"[task] {name}")
+    return task_class(settings, name=name, preset=preset, pacing=pacing, rng=rng)
+
+
+def _load_class(name: str, table: Mapping[str, Any]) -> type[Task]:
+    if name not in table:
+        raise ConfigError(f"[task] name = {name!r}: expected one of {', '.join(sorted(table))}")
+    module_name, _, class_name = str(table[name]).partition(":")
+    try:
+        task_class = getattr(importlib.import_module(module_name), class_name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"[tasks] {name} = {table[name]!r}: expected module:Class that imports: {error}") from error
+    if not (isinstance(task_class, type) and issubclass(task_class, Task)):
+        raise ConfigError(f"[tasks] {name} = {table[name]!r}: expected a subclass of Task")
+    return task_class

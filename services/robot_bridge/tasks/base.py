@@ -1,0 +1,86 @@
+"""What the bridge asks of a task: a world that goes on by itself, and what is rewarded in it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from common.messages import Float32Array, Int64Array, TaskSpec, UInt8Array
+
+
+@dataclass(frozen=True)
+class SensorReading:
+    """What the robot's sensors show now."""
+
+    frames: UInt8Array
+    """(k, H, W, C): camera frames that are new since the reading before, oldest first."""
+    frame_ids: Int64Array
+    """(k,): consecutive over the task's lifetime."""
+    frame_capture_ns: Int64Array
+    """(k,): capture times on the clock given to :meth:`Task.advance_to`."""
+    proprioception: Float32Array
+    """(P,), physical units."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Reward and termination of the action cycle that has just ended."""
+
+    reward: float
+    terminated: bool
+
+
+class Task(ABC):
+    """A robot, its surroundings and a goal.
+
+    The world never pauses: whoever uses a task tells it the time by :meth:`advance_to`, and the robot goes on with
+    its last command until then. In real time that time is the computer's clock, in lockstep it moves by one action
+    cycle per step; the task does not know which.
+    """
+
+    SETTINGS: ClassVar[type]
+    """Dataclass of the task's settings (:func:`common.config.setting`), the keys of ``[task]``."""
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]]
+    """Preset name -> settings that differ from the defaults; the first is the task's default preset."""
+
+    spec: TaskSpec
+
+    @abstractmethod
+    def __init__(self, settings: Any, *, name: str, preset: str, pacing: str, rng: np.random.Generator) -> None:
+        """Build the world; ``name``, ``preset`` and ``pacing`` go into the TaskSpec, ``rng`` is all randomness."""
+
+    @abstractmethod
+    def begin_episode(self) -> None:
+        """Draw a new goal and put the robot at a random start."""
+
+    @abstractmethod
+    def begin_attempt(self) -> None:
+        """Keep the goal and move the robot to a random state (thesis 6.1)."""
+
+    @abstractmethod
+    def command(self, action: Float32Array) -> None:
+        """Give the robot a command, (A,) physical units inside the bounds; it takes effect now and stays."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Bring the robot to rest, as the watchdog does."""
+
+    @abstractmethod
+    def advance_to(self, now_ns: int) -> None:
+        """Let the world go on until ``now_ns``; the first call only sets its clock."""
+
+    @abstractmethod
+    def read(self) -> SensorReading:
+        """Read the sensors at the time of the last :meth:`advance_to`."""
+
+    @abstractmethod
+    def outcome(self) -> Outcome:
+        """Judge the cycle that ended at the last :meth:`advance_to`."""
+
+    def close(self) -> None:
+        """Let go of the robot."""
+        self.stop()
