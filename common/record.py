@@ -8,12 +8,14 @@ the tables a service adds rows to.
 from __future__ import annotations
 
 import csv
+import io
 import json
 import logging
 import os
 import queue
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -41,6 +43,13 @@ def read_parts(directory: Path, service: str = "*") -> list[dict[str, Any]]:
     return sorted(parts, key=lambda part: int(part.get("incarnation", 0)))
 
 
+@dataclass
+class _Table:
+    file: TextIO
+    writer: Any
+    columns: list[str]
+
+
 class RunRecord:
     """Queue in front of the disk. Every method returns at once; what does not fit is dropped and counted."""
 
@@ -50,7 +59,7 @@ class RunRecord:
         """Entries that were not written, because the queue was full or the disk refused."""
         self._service, self._incarnation = service, incarnation
         self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(_QUEUE_LENGTH)
-        self._tables: dict[str, tuple[TextIO, Any, Sequence[str]]] = {}
+        self._tables: dict[str, _Table] = {}
         self._tensorboard: Any = None
         self._thread = threading.Thread(target=self._run, name="record", daemon=True)
 
@@ -71,7 +80,7 @@ class RunRecord:
         self._put(lambda: write_atomically(path, json.dumps(content, indent=1)))
 
     def row(self, table: str, values: Mapping[str, Any]) -> None:
-        """Append a row to ``RUN_DIR/<table>.csv``; all rows of a table have the same columns."""
+        """Append a row to ``RUN_DIR/<table>.csv``; new columns are added to the table."""
         row = dict(values)
         self._put(lambda: self._write_row(table, row))
 
@@ -94,30 +103,39 @@ class RunRecord:
                 self.dropped += 1
                 if self.dropped == 1:
                     logger.error("%s: the record cannot be written: %s", self.directory, error)
-        for file, _, _ in self._tables.values():
-            file.close()
+        for table in self._tables.values():
+            table.file.close()
         if self._tensorboard:
             self._tensorboard.close()
 
     def _write_row(self, table: str, row: Mapping[str, Any]) -> None:
-        if table not in self._tables:
-            self._tables[table] = self._open_table(table, list(row))
-        file, writer, columns = self._tables[table]
-        writer.writerow([row.get(column, "") for column in columns])
-        file.flush()
+        if table not in self._tables or not row.keys() <= set(self._tables[table].columns):
+            self._tables[table] = self._open_table(table, row)
+        open_table = self._tables[table]
+        open_table.writer.writerow([row.get(column, "") for column in open_table.columns])
+        open_table.file.flush()
 
-    def _open_table(self, table: str, columns: list[str]) -> tuple[TextIO, Any, Sequence[str]]:
+    def _open_table(self, table: str, row: Mapping[str, Any]) -> _Table:
+        """Open for appending; columns that are new since the table began are added to all its rows."""
+        if table in self._tables:
+            self._tables.pop(table).file.close()
         path = self.directory / f"{table}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists() and path.stat().st_size:
+        columns: list[str] = []
+        if path.exists():
             with path.open(encoding="utf-8", newline="") as existing:
-                if next(csv.reader(existing), []) != columns:
-                    path = path.with_name(f"{path.stem}-{self._incarnation}.csv")
+                rows = list(csv.reader(existing))
+            columns = rows[0] if rows else []
+            added = [name for name in row if name not in columns]
+            if columns and added:
+                text = io.StringIO()
+                csv.writer(text).writerows([columns + added, *([*old, *[""] * len(added)] for old in rows[1:])])
+                write_atomically(path, text.getvalue())
         file = path.open("a", encoding="utf-8", newline="")
         writer = csv.writer(file)
-        if file.tell() == 0:
-            writer.writerow(columns)
-        return file, writer, columns
+        if not columns:
+            writer.writerow(list(row))
+        return _Table(file, writer, [*columns, *(name for name in row if name not in columns)])
 
     def _write_metrics(self, step: int, row: Mapping[str, float]) -> None:
         self._write_row(f"metrics/{self._service}", row)

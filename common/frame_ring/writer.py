@@ -213,8 +213,7 @@ class RingWriter(RingView):
         row["oldest_frame"] = oldest
         row["oldest_frame_bound"] = max(bound, oldest) if stack else bound
         row["new_frames"] = new
-        is_there = oldest >= frames_end - self.layout.capacity_frames
-        row["whole"] = self._stack is None or (stack is not None and stack.whole and is_there)
+        row["whole"] = self._stack is None or (stack is not None and stack.whole)
         row["pair"] = before is not None and self._continues(before, row)
         row["transitions"] = row["pair"] + (before["transitions"] if before is not None else 0)
 

@@ -49,16 +49,13 @@ class Ledger:
     def __init__(self, spec: TaskSpec, totals: Totals | None = None) -> None:
         self._spec = spec
         self.totals = totals or Totals()
+        self.episode = self.totals.episodes
+        """Number of the running attempt's episode; the TimeStep that ends an episode still belongs to it."""
         self.step_index = 0
         """Action cycles since the attempt began."""
         self._return = 0.0
         self._length = 0
         self._attempts = 0
-
-    @property
-    def episode(self) -> int:
-        """Number of the running episode."""
-        return self.totals.episodes
 
     @property
     def attempt(self) -> int:
@@ -69,6 +66,7 @@ class Ledger:
         """Start to count a new attempt."""
         self.totals = replace(self.totals, attempts=self.totals.attempts + 1)
         self._attempts += 1
+        self.episode = self.totals.episodes
         self.step_index = 0
 
     def end_cycle(self, reward: float, terminated: bool) -> tuple[bool, EpisodeResult | None]:
