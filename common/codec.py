@@ -9,6 +9,7 @@ read-only views of the received bytes: nothing is copied.
 from __future__ import annotations
 
 import math
+import reprlib
 import types
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -27,6 +28,8 @@ Sizes = dict[str, int]
 Decoder = Callable[[Any, str, Sizes], Any]
 
 _UNBOUNDED = Bounds()
+_shown = reprlib.repr
+"""Text of what came, short enough for a log whatever it is."""
 _BY_NAME = {message.__name__: message for message in MESSAGES}
 
 
@@ -58,14 +61,15 @@ def decode(payload: bytes, expected: type[Message], dimensions: Dimensions | Non
     if not isinstance(values, dict):
         raise MessageError(f"{name}: expected a msgpack map, got {type(values).__name__}")
     schema = values.pop("schema", None)
-    if schema != SCHEMA_VERSION:
+    if type(schema) is not int or schema != SCHEMA_VERSION:
         raise SchemaVersionError(
-            f"{name}: expected schema version {SCHEMA_VERSION}, got {schema!r}; run the same release on all computers"
+            f"{name}: expected schema version {SCHEMA_VERSION}, got {_shown(schema)}; "
+            "run the same release on all computers"
         )
     message = values.pop("message", None)
     if message != name:
-        known = "" if message in _BY_NAME else " (unknown to this release)"
-        raise MessageError(f"expected message {name}, got {message!r}{known}")
+        known = "" if isinstance(message, str) and message in _BY_NAME else " (unknown to this release)"
+        raise MessageError(f"expected message {name}, got {_shown(message)}{known}")
     sizes = {} if dimensions is None else dict(vars(dimensions))
     decoded: Message = _decode_dataclass(expected, values, name, sizes)
     return decoded
@@ -101,7 +105,7 @@ def _decode_dataclass(cls: Any, values: Any, where: str, sizes: Sizes) -> Any:
     if len(values) != len(decoders) or any(name not in values for name, _ in decoders):
         names = {name for name, _ in decoders}
         missing, unknown = sorted(names - values.keys()), sorted(map(str, values.keys() - names))
-        raise MessageError(f"{where}: missing fields {missing}, unknown fields {unknown}")
+        raise MessageError(f"{where}: missing fields {missing}, unknown fields {_shown(unknown)}")
     return cls(**{name: decoder(values[name], f"{where}.{name}", sizes) for name, decoder in decoders})
 
 
@@ -117,7 +121,7 @@ def _decoder(hint: Any, bounds: Bounds = _UNBOUNDED) -> Decoder:
     if origin is dict:
         element = _decoder(arguments[1])
         return lambda value, where, sizes: {
-            _text(key, where): element(item, f"{where}[{key}]", sizes)
+            _text(key, where): element(item, f"{where}[{key:.40}]", sizes)
             for key, item in _instance(value, dict, where).items()
         }
     if origin is list:
@@ -149,7 +153,7 @@ def _enumeration(cls: type[StrEnum], value: Any, where: str) -> StrEnum:
     try:
         return cls(value)
     except ValueError:
-        raise MessageError(f"{where}: expected one of {[m.value for m in cls]}, got {value!r}") from None
+        raise MessageError(f"{where}: expected one of {[m.value for m in cls]}, got {_shown(value)}") from None
 
 
 def _number(kind: type, value: Any, where: str, bounds: Bounds) -> Any:
@@ -170,17 +174,20 @@ def _array_decoder(dtype: np.dtype[Any], shape: tuple[str | int, ...]) -> Decode
             raise MessageError(f"{where}: expected [dtype, shape, bytes], got {type(value).__name__}")
         sent_dtype, sent_shape, raw = value
         if sent_dtype != dtype.str:
-            raise MessageError(f"{where}: expected dtype {dtype.str}, got {sent_dtype!r}")
+            raise MessageError(f"{where}: expected dtype {dtype.str}, got {_shown(sent_dtype)}")
         valid = isinstance(sent_shape, list) and all(type(n) is int and n >= 0 for n in sent_shape)
         if not valid or len(sent_shape) != len(shape):
-            raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {sent_shape!r}")
+            raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {_shown(sent_shape)}")
         for letter, size in zip(shape, sent_shape, strict=True):
             wanted = letter if isinstance(letter, int) else sizes.setdefault(letter, size)
             if size != wanted:
                 raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {sent_shape}")
         if not isinstance(raw, bytes) or len(raw) != math.prod(sent_shape) * dtype.itemsize:
             raise MessageError(f"{where}: {sent_shape} of {dtype} do not fit the bytes that came")
-        result = np.frombuffer(raw, dtype).reshape(sent_shape)
+        try:
+            result = np.frombuffer(raw, dtype).reshape(sent_shape)
+        except (ValueError, OverflowError) as error:
+            raise MessageError(f"{where}: {sent_shape} cannot be the shape of an array: {error}") from error
         if dtype.kind == "f" and not np.isfinite(result).all():
             raise MessageError(f"{where}: expected finite numbers, got NaN or infinity")
         return result

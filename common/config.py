@@ -46,7 +46,9 @@ def load_config(cls: type[Config], path: Path, overrides: Iterable[str] = ()) ->
         section, key, value = parse_override(override)
         if section not in section_names(cls):
             raise ConfigError(f"--set {override}: no section [{section}]{_hint(section, section_names(cls))}")
-        tables.setdefault(section, {})[key] = value
+        table = tables.setdefault(section, {})
+        if isinstance(table, dict):  # What else may stand there is refused below.
+            table[key] = value
     return build_config(cls, tables, str(path))
 
 
@@ -56,7 +58,7 @@ def read_toml(path: Path) -> Tables:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ConfigError(f"{path}: not a TOML file: {error}") from error
 
 
@@ -68,7 +70,7 @@ def parse_override(override: str) -> tuple[str, str, Any]:
         raise ConfigError(f"--set {override!r}: expected section.key=value, for example task.preset=thesis")
     try:
         return section, key, tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except ValueError:
         return section, key, text.strip()
 
 

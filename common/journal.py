@@ -156,17 +156,13 @@ class OrderedReceiver(Generic[Item]):
         """Learn what the sender has sent and can still resend."""
         if not self._follow(head.stream):
             return
-        self._end_seq = max(self._end_seq, head.next_seq)
+        self._end_seq = max(self._end_seq, head.next_seq, head.oldest_seq)
         if self._next_seq is None:
             # A receiver that starts late begins where the sender still has something: what was before has been
             # acknowledged by its predecessor.
-            self._next_seq = self._taken_seq = head.oldest_seq
-        for seq in range(self._next_seq, head.oldest_seq):
-            if seq in self._waiting:
-                self._ready.append(self._waiting.pop(seq))
-            else:
-                self.lost += 1
-        self._next_seq = max(self._next_seq, head.oldest_seq)
+            self._next_seq = self._taken_seq = min([head.oldest_seq, *self._waiting])
+        if head.oldest_seq > self._next_seq:
+            self._give_up_before(head.oldest_seq)
         self._advance()
 
     def take_ready(self) -> list[Item]:
@@ -181,16 +177,13 @@ class OrderedReceiver(Generic[Item]):
         if self.stream is None or self._next_seq is None:
             return None
         missing: list[tuple[int, int]] = []
-        start = None
-        for seq in range(self._next_seq, self._end_seq + 1):
-            absent = seq < self._end_seq and seq not in self._waiting
-            if absent and start is None:
-                start = seq
-            elif not absent and start is not None:
+        start = self._next_seq
+        for seq in [*sorted(self._waiting), self._end_seq]:
+            if seq > start:
                 missing.append((start, seq))
-                start = None
-                if len(missing) == MAX_RANGES:
-                    break
+            start = seq + 1
+            if len(missing) == MAX_RANGES:
+                break
         ranges = np.array(missing, dtype=np.int64).reshape(-1, 2)
         return Acknowledgement(self.stream, self._taken_seq, ranges, updates_owed)
 
@@ -199,13 +192,18 @@ class OrderedReceiver(Generic[Item]):
         if self.stream is not None and stream < self.stream:
             return False
         if self.stream != stream:
-            if self._next_seq is not None:
-                # The old sender's memory is gone: hand on what came of it, count the rest.
-                self.lost += self._end_seq - self._next_seq - len(self._waiting)
-            self._ready += [self._waiting[seq] for seq in sorted(self._waiting)]
-            self._waiting.clear()
+            # The old sender's memory is gone: what has not come will not come.
+            self._give_up_before(self._end_seq)
             self.stream, self._next_seq, self._end_seq, self._taken_seq = stream, None, 0, 0
         return True
+
+    def _give_up_before(self, end_seq: int) -> None:
+        """Hand on what came of the messages before ``end_seq``; count the others as lost."""
+        start = min(self._waiting, default=end_seq) if self._next_seq is None else self._next_seq
+        arrived = sorted(seq for seq in self._waiting if seq < end_seq)
+        self._ready += [self._waiting.pop(seq) for seq in arrived]
+        self.lost += end_seq - start - len(arrived)
+        self._next_seq = end_seq
 
     def _advance(self) -> None:
         while self._next_seq is not None and self._next_seq in self._waiting:

@@ -62,8 +62,8 @@ class Bounds:
     high: float | None = None
 
 
-Count = Annotated[int, Bounds(low=0)]
-"""A whole number that is never negative."""
+Count = Annotated[int, Bounds(low=0, high=2**62)]
+"""A whole number that is never negative and fits an int64, one more of it too."""
 
 
 @dataclass(frozen=True)

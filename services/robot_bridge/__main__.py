@@ -37,10 +37,11 @@ def serve(service: Service, config: RobotBridgeConfig) -> None:
 
 def _earlier_totals(directory: Path) -> Totals:
     """Where the last incarnation of this run's bridge was when it last wrote; at most a second is counted again."""
-    parts = read_parts(directory, topics.ROBOT_BRIDGE)
+    # A bridge that has not come as far as its task, as this one, has written a part without counts.
+    parts = [part for part in read_parts(directory, topics.ROBOT_BRIDGE) if "steps" in part.get("counters", {})]
     if not parts:
         return Totals()
-    counters = parts[-1].get("counters", {})
+    counters = parts[-1]["counters"]
     names = ("steps", "acted_steps", "episodes", "attempts")
     totals = Totals(**{name: int(counters.get(name, 0)) for name in names})
     logger.warning("this run has had a robot_bridge before: going on from step %d", totals.steps)

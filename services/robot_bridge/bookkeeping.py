@@ -20,6 +20,7 @@ class EpisodeResult:
     length: int
     """Action cycles, resets included."""
     attempts: int
+    """Attempts with at least one action cycle."""
     steps: int
     """Action cycles of the run when the episode ended, resets included."""
     acted_steps: int
@@ -65,12 +66,12 @@ class Ledger:
     def begin_attempt(self) -> None:
         """Start to count a new attempt."""
         self.totals = replace(self.totals, attempts=self.totals.attempts + 1)
-        self._attempts += 1
         self.episode = self.totals.episodes
         self.step_index = 0
 
     def end_cycle(self, reward: float, terminated: bool) -> tuple[bool, EpisodeResult | None]:
         """Count one action cycle; return whether the time limit truncates the attempt, and the ended episode."""
+        self._attempts += self.step_index == 0
         self.step_index += 1
         self._count(reward, acted=True)
         truncated = not terminated and self.step_index >= self._spec.time_limit_steps

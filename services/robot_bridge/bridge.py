@@ -39,6 +39,8 @@ REPUBLISH_NS = 1_000_000_000
 """In lockstep, a TimeStep is published again after this long without an answer."""
 REMEMBERED_STEPS = 256
 """An action that answers an older TimeStep than this is not even counted as late."""
+WAITING_TOLD_NS = 10_000_000_000
+"""How often the log says what the robot waits for."""
 PEERS = (topics.ACTOR, topics.REPLAY)
 """Without these no attempt starts: nobody would act, or nothing would be kept."""
 
@@ -55,10 +57,11 @@ class CommandInForce:
 
 @dataclass
 class PublishedStep:
-    """When a TimeStep was published, and when the cycle that it began ended."""
+    """When a TimeStep was published, when the cycle that it began ended, and whether an answer has come."""
 
     published_ns: int
     end_ns: int | None = None
+    answered: bool = False
 
 
 @dataclass
@@ -117,6 +120,7 @@ class RobotBridge:
         self._in_force = self._no_command()
         self._world_ns = self._clock.now_ns()
         self._payload = b""
+        self._told_ns = self._clock.now_ns()
         service.counters = self.counters
         service.details = self.details
         service.serve_commands(
@@ -128,19 +132,24 @@ class RobotBridge:
         """Act until the run's steps are done or the service is asked to stop; then hand over what is on its way."""
         self._journal.start()
         self._service.state = "running"
+        try:
+            self._run_attempts()
+            self._finish("stopped" if self._service.stopping.is_set() else "steps")
+        finally:
+            self._journal.stop()
+
+    # ------------------------------------------------------------------ attempts
+
+    def _run_attempts(self) -> None:
         self._task.advance_to(self._world_ns)
         try:
             while not self._over():
-                if not self._ready():
+                if self._ready():
+                    self._run_attempt()
+                else:
                     self._engage()
-                    continue
-                self._run_attempt()
         finally:
             self._task.close()
-        self._finish("stopped" if self._service.stopping.is_set() else "steps")
-        self._journal.stop()
-
-    # ------------------------------------------------------------------ attempts
 
     def _run_attempt(self) -> None:
         self._begin_attempt()
@@ -193,7 +202,7 @@ class RobotBridge:
                 while not self._service.stopping.is_set() and self._clock.now_ns() < self._keeper.deadline_ns:
                     self._sleep_until(self._keeper.deadline_ns)
                     self._take_actions()
-                self._count_cycle()
+            self._count_cycle()
             self._advance_world()
             self._ledger.end_reset_cycle()
 
@@ -215,20 +224,20 @@ class RobotBridge:
                 self._stop_robot()
             if self._service.stopping.is_set():
                 return False
-            if now_ns >= self._keeper.deadline_ns and not self._waits_longer(now_ns):
+            if now_ns >= self._keeper.deadline_ns and not self._waits_longer():
                 return True
-            limits = [self._keeper.deadline_ns] if now_ns < self._keeper.deadline_ns else []
-            if not self._watchdog.stopped:
-                limits.append(self._watchdog.deadline_ns)
-            self._sleep_until(min(limits))
+            deadlines = self._keeper.deadline_ns, self._watchdog.deadline_ns
+            self._sleep_until(min(deadline for deadline in deadlines if deadline > now_ns))
 
-    def _waits_longer(self, now_ns: int) -> bool:
+    def _waits_longer(self) -> bool:
         """With ``wait``, the cycle lasts until its action has come; the watchdog is the limit."""
-        answered = self._in_force.source is ActionSource.POLICY
-        if self._settings.on_missing_action != "wait" or answered or self._watchdog.stopped:
+        if self._settings.on_missing_action != "wait":
             return False
-        self._keeper.stretch(now_ns)
-        return True
+        if self._in_force.source is not ActionSource.POLICY and not self._watchdog.stopped:
+            return True
+        # What was waited for is not the bridge's own lateness.
+        self._keeper.stretch(self._in_force.applied_ns)
+        return False
 
     def _wait_for_answer(self) -> bool:
         published_ns = self._clock.now_ns()
@@ -244,7 +253,7 @@ class RobotBridge:
 
     def _sleep_until(self, deadline_ns: int) -> None:
         with self._service.wake:
-            if not self._actions and not self._service.stopping.is_set():
+            if not (self._actions or self._must_stop() or self._service.stopping.is_set()):
                 self._clock.wait_until(deadline_ns, self._service.wake)
 
     def _count_cycle(self) -> None:
@@ -270,13 +279,17 @@ class RobotBridge:
     # ------------------------------------------------------------------ actions
 
     def _take_actions(self) -> None:
-        if self._watchdog.latched and self._in_force.source is not ActionSource.STOP:
+        if self._must_stop():
             self._stop_robot()
         for arrived in self._actions.take():
             if self._is_wanted(arrived):
                 self._apply(arrived)
             else:
                 self.counts.refused_actions += 1
+
+    def _must_stop(self) -> bool:
+        """True if a latch has been set that the robot does not know of yet."""
+        return self._watchdog.latched is not None and self._in_force.source is not ActionSource.STOP
 
     def _is_wanted(self, arrived: Arrived[Action]) -> bool:
         """Count and record an action that answers this attempt; True if it is to be applied."""
@@ -287,22 +300,29 @@ class RobotBridge:
         if action.actor_incarnation < self._actor_incarnation:
             return False
         self._actor_incarnation = action.actor_incarnation
+        if not step.answered:
+            self._record_answer(step, arrived)
+        newest_answered = max(self._in_force.answered_seq, self._attempt_first_seq - 1)
+        if action.answered_seq <= newest_answered:
+            return False
+        if not self._realtime:
+            return self._watchdog.latched is None
+        return self._watchdog.accept(step.published_ns, arrived.at_ns)
+
+    def _record_answer(self, step: PublishedStep, arrived: Arrived[Action]) -> None:
+        step.answered = True
         late = step.end_ns is not None and arrived.at_ns > step.end_ns
         self.counts.late_actions += late
         self._service.record.row(
             "actions",
             {
-                "incarnation": action.incarnation,
-                "answered_seq": action.answered_seq,
+                "incarnation": arrived.message.incarnation,
+                "answered_seq": arrived.message.answered_seq,
                 "published_ns": step.published_ns,
                 "arrived_ns": arrived.at_ns,
                 "late": int(late),
             },
         )
-        newest_answered = max(self._in_force.answered_seq, self._attempt_first_seq - 1)
-        if action.answered_seq <= newest_answered:
-            return False
-        return not self._realtime or self._watchdog.accept(step.published_ns, arrived.at_ns)
 
     def _apply(self, arrived: Arrived[Action]) -> None:
         self._engaged = True
@@ -356,7 +376,7 @@ class RobotBridge:
         )
         if not time_step.is_last:
             self._published[time_step.seq] = PublishedStep(now_ns)
-            self._published.pop(time_step.seq - REMEMBERED_STEPS, None)
+        self._published.pop(time_step.seq - REMEMBERED_STEPS, None)
         self._payload = encode(time_step)
         self.counts.produced += 1
         self._journal.put(time_step.seq, self._payload)
@@ -377,6 +397,7 @@ class RobotBridge:
         self._task.stop()
         waiting = [peer for peer in PEERS if self._service.peer_state(peer) not in ("running", "draining")]
         if waiting or self._watchdog.latched:
+            self._tell_waiting(waiting)
             self._service.stopping.wait(0.05)
             return
         logger.info("actor and replay are there: asking for a first answer")
@@ -390,6 +411,12 @@ class RobotBridge:
             self._take_actions()
         self._task.stop()
         self._keeper.start(self._clock.now_ns())
+
+    def _tell_waiting(self, waiting: list[str]) -> None:
+        if self._clock.now_ns() - self._told_ns > WAITING_TOLD_NS:
+            self._told_ns = self._clock.now_ns()
+            reason = self._watchdog.latched or " and ".join(waiting)
+            logger.warning("the robot waits for: %s", {"pause": "resume", "e_stop": "resume"}.get(reason, reason))
 
     def _finish(self, reason: str) -> None:
         finished = encode(Finished(self._service.incarnation, self.counts.produced, reason))

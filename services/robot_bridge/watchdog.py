@@ -44,7 +44,7 @@ class Watchdog:
 
     def expire(self, now_ns: int) -> bool:
         """True once, when the time without a fresh action is up: the robot has to stop now."""
-        if self._expired or now_ns < self.deadline_ns:
+        if self.stopped or now_ns < self.deadline_ns:
             return False
         self._expired = True
         self.stops += 1

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,8 +57,7 @@ def test_one_transition_by_hand(path, channels):
     ring, bridge = make_ring(path, spec=spec), Bridge()
     for made in (bridge.start(), bridge.step(new=2, terminated=True)):
         step = made.time_step
-        object.__setattr__(step, "frames", step.frames[..., :channels])
-        ring.append(made)
+        ring.append(replace(made, time_step=replace(step, frames=step.frames[..., :channels])))
     got = RingReader(path).gather(np.array([1]))
     assert got.valid.tolist() == [True]
     expected = np.concatenate([crop_of([i])[..., :channels] for i in (0, 0, 0)], axis=-1)
@@ -191,20 +191,43 @@ def test_no_transition_crosses_attempts_episodes_or_incarnations(path):
     assert every_pair(ring).tolist() == [1, 3, 4, 6, 8]
 
 
-def test_two_bridges_whose_numbers_fit_make_no_pair(path):
-    ring, one, other = make_ring(path), Bridge(incarnation=1), Bridge(incarnation=2)
-    other.start()
-    append_all(ring, [one.start(), other.step()])
-    assert every_pair(ring).tolist() == []
+@pytest.mark.parametrize(
+    ("whose", "fields", "is_pair"),
+    [
+        ("second", {}, True),
+        ("second", {"incarnation": 2}, False),
+        ("second", {"seq": 3}, False),
+        ("second", {"seq": 0}, False),
+        ("second", {"episode": 1}, False),
+        ("second", {"attempt": 1}, False),
+        ("second", {"step_index": 1}, False),
+        ("second", {"step_index": 3}, False),
+        ("first", {"terminated": True}, False),
+        ("first", {"truncated": True}, False),
+        ("second", {"terminated": True}, True),
+        ("second", {"truncated": True}, True),
+    ],
+)
+def test_a_transition_is_two_consecutive_experiences_of_one_attempt(path, whose, fields, is_pair):
+    ring, bridge = make_ring(path, spec=task_spec(camera=False)), Bridge(camera=False)
+    bridge.start()
+    made = {"first": bridge.step(), "second": bridge.step()}
+    step = made[whose].time_step
+    made[whose] = replace(made[whose], time_step=replace(step, **fields))
+    append_all(ring, made.values())
+    assert every_pair(ring).tolist() == ([1] if is_pair else [])
+    assert RingReader(path).gather(np.array([0, 1])).valid.tolist() == [False, is_pair]
+    assert ring.transitions_appended == is_pair
 
 
 def test_any_row_number_is_safe_to_ask_for(path):
     ring, bridge = make_ring(path, 10), Bridge()
     append_all(ring, [bridge.start(), *(bridge.step() for _ in range(24))])
-    rows = np.array([-(2**63), -1, 0, 3, 24, 25, 26, 2**63 - 1])
+    # Rows 15 to 24 are there, so the transitions that end in 16 to 24.
+    rows = np.array([-(2**63), -1, 0, 3, 15, 16, 24, 25, 26, 2**63 - 1])
     got = RingReader(path).gather(rows)
-    assert got.valid.tolist() == [False, False, False, False, True, False, False, False]
-    assert len(drop_overtaken(got).reward) == 1
+    assert got.valid.tolist() == [False] * 5 + [True, True] + [False] * 3
+    assert len(drop_overtaken(got).reward) == 2
 
 
 def test_an_empty_ring_has_no_rows(path):
@@ -240,20 +263,28 @@ def test_what_the_writer_overtakes_during_a_gather_is_reported(path, monkeypatch
     assert drop_overtaken(view.gather(np.array([1, 2]))) is None
 
 
-def test_a_row_that_is_just_being_overwritten_is_not_valid(path, monkeypatch):
-    ring, bridge = make_ring(path, 20, 1.0), Bridge()
+class Watched(np.ndarray):
+    """An array that looks at the ring whenever something is stored in it."""
+
+    def __setitem__(self, key, value):
+        self.look()
+        super().__setitem__(key, value)
+
+
+@pytest.mark.parametrize("part", ["_frames", "_rows"])
+def test_what_is_just_being_overwritten_is_not_valid(path, part):
+    camera = part == "_frames"
+    spec = task_spec(camera)
+    ring, bridge = make_ring(path, 20, 1.0, spec), Bridge(camera=camera)
     append_all(ring, [bridge.start(), *(bridge.step() for _ in range(19))])
     view, seen = RingReader(path), []
-
-    class Frames(np.ndarray):
-        def __setitem__(self, key, value):
-            seen.append(view.gather(np.arange(1, 6)).valid.tolist())
-            super().__setitem__(key, value)
-
-    ring._frames = ring._frames.view(Frames)
+    assert view.gather(np.array([1])).valid.all()
+    watched = getattr(ring, part).view(Watched)
+    watched.look = lambda: seen.append(view.gather(np.arange(1, 6)).valid.tolist())
+    setattr(ring, part, watched)
     ring.append(bridge.step())
-    # Frame 20 goes where frame 0 was, which rows 0 to 2 show; row 20 goes where row 0 was.
-    assert seen == [[False, False, False, True, True]]
+    # Row 20 goes where row 0 was, frame 20 where frame 0 was, and that is shown by rows 0 to 2.
+    assert seen == [[False, False, False, True, True] if camera else [False, True, True, True, True]]
 
 
 def test_whatever_a_concurrent_writer_does_valid_rows_are_right(path):
@@ -291,9 +322,8 @@ def test_what_does_not_fit_the_task_is_refused_and_leaves_the_ring_as_it_was(pat
     }
     good = bridge.step()
     for name, value in bad.items():
-        step = type(good.time_step)(**{**vars(good.time_step), name: value})
         with pytest.raises(MessageError):
-            ring.append(type(good)(5, 1, step, good.extras))
+            ring.append(replace(good, time_step=replace(good.time_step, **{name: value})))
     assert (ring.rows_appended, ring.frames_appended) == (1, 1)
     append_all(ring, [good, bridge.step()])
     assert_right(bridge, bridge.experiences, [1, 2], RingReader(path).gather(np.array([1, 2])).minibatch)

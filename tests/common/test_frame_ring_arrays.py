@@ -1,5 +1,7 @@
 """The network's path for minibatches equals the mapped one, bit for bit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -95,10 +97,6 @@ def test_without_camera_there_is_one_part_without_frames(path):
         np.testing.assert_array_equal(getattr(got, name), getattr(expected, name), strict=True)
 
 
-def changed(part, **fields):
-    return ArrayMinibatch(**{**vars(part), **fields})
-
-
 def test_frame_indices_outside_are_refused(ring):
     parts = array_minibatch(ring, every_pair(ring), 0, 0, max_bytes=7000)
     unique = sum(len(part.frames) for part in parts)
@@ -107,9 +105,9 @@ def test_frame_indices_outside_are_refused(ring):
             index = getattr(parts[0], name).copy()
             index[3, 1] = wrong
             with pytest.raises(MessageError, match=rf"{name}: expected indices from 0 to {unique - 1}, got"):
-                minibatch_from_arrays([changed(parts[0], **{name: index}), *parts[1:]])
+                minibatch_from_arrays([replace(parts[0], **{name: index}), *parts[1:]])
     with pytest.raises(MessageError, match="indices"):
-        minibatch_from_arrays([changed(parts[0], frames=parts[0].frames[:0], parts=1)])
+        minibatch_from_arrays([replace(parts[0], frames=parts[0].frames[:0], parts=1)])
 
 
 def test_parts_that_do_not_belong_together_are_refused(ring):

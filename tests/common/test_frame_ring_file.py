@@ -60,6 +60,7 @@ def test_what_is_persisted_survives_wraps_and_restarts(path):
     append_all(ring, made[:3] + made[4:])
     for _ in range(2):
         assert ring.persisted_count == 31 + 5
+        assert ring.persisted_counts() == {1: 31, 2: 5}
         assert ring.persisted_ranges(1) == [(0, 31)]
         assert ring.persisted_ranges(2) == [(0, 3), (4, 6)]
         assert ring.contains(1, 0)
@@ -115,11 +116,26 @@ def test_a_process_killed_inside_append_leaves_a_ring_without_the_unfinished_row
     rows = every_pair(view)
     assert len(rows) > 5
     assert_right(bridge, bridge.experiences, rows, view.gather(rows).minibatch)
-    # The sender still has it, and it is as good as new. Fewer frames this time must not revive spoilt slots.
+    # The sender still has it, and it is as good as new.
     append_all(ring, [unfinished, bridge.step(new=0), bridge.step(new=0)])
     rows = every_pair(view)
     assert rows[-3:].tolist() == [46, 47, 48]
     assert_right(bridge, bridge.experiences, rows, view.gather(rows).minibatch)
+
+
+def test_frames_spoilt_by_a_killed_process_stay_gone_if_fewer_come_next(path):
+    ring, bridge = make_ring(path, 20, 1.0), Bridge()
+    append_all(ring, [bridge.start(), *(bridge.step(new=2) for _ in range(45))])
+    ring._frames = Fragile(ring._frames, 2)
+    with pytest.raises(Killed):
+        ring.append(bridge.step(new=3))
+    left_behind = path.with_name("left_behind")
+    shutil.copy(path, left_behind)
+    ring = make_ring(left_behind, 20, 1.0)
+    ring.append(Bridge(incarnation=2).start(new=1))
+    rows = every_pair(ring)
+    assert len(rows) > 5
+    assert_right(bridge, bridge.experiences, rows, RingReader(left_behind).gather(rows).minibatch)
 
 
 def test_a_process_killed_before_it_counted_a_stored_row_has_it(path):

@@ -1,0 +1,113 @@
+"""The launcher's handle on the process that moves a link's traffic."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from deploy.network.conditions import NetworkConditions
+from deploy.network.errors import LinkFailedError, LinkUnavailable
+from deploy.network.part import NetworkPart
+
+_REPOSITORY = Path(__file__).resolve().parents[2]
+_READY_TIMEOUT_S = 15.0
+_STOP_TIMEOUT_S = 3.0
+
+
+class LinkProcess:
+    """The launcher's handle on a link process: start it, hear that it is ready, end it."""
+
+    def __init__(self, module: str, conditions: NetworkConditions, run_dir: Path, seed: int) -> None:
+        self._module = module
+        self._conditions = conditions
+        self._seed = seed
+        self._part_path = run_dir / "network.json"
+        self._log_path = run_dir / "network.log"
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self, arguments: Sequence[str]) -> dict[str, Any]:
+        """Start the process and return what it says when it is ready.
+
+        It ends with the thread that calls this, at the latest: call it from the main thread.
+        """
+        self._part_path.parent.mkdir(parents=True, exist_ok=True)
+        command = [
+            *(sys.executable, "-m", self._module),
+            *("--conditions", json.dumps(self._conditions.to_table())),
+            *("--part", str(self._part_path), "--seed", str(self._seed), "--parent-pid", str(os.getpid())),
+            *arguments,
+        ]
+        # A session of its own: Ctrl-C on the launcher must not cut the link before the services have said
+        # goodbye.
+        with self._log_path.open("wb") as log:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env={**os.environ, "PYTHONPATH": _python_path()},
+                start_new_session=True,
+            )
+        return self._wait_until_ready(self._process)
+
+    def part(self) -> NetworkPart:
+        """The link's part of the record: about a second old, and final once the process has been stopped."""
+        try:
+            return NetworkPart.read(self._part_path)
+        except FileNotFoundError as error:
+            raise LinkFailedError(f"{self._part_path}: not there; the link has never been up") from error
+
+    def failure(self) -> str | None:
+        """Why the process ended by itself; None while it runs, and after it was stopped."""
+        if self._process is None or self._process.poll() is None:
+            return None
+        return f"{self._module} ended with exit code {self._process.returncode}: {self._log_tail()}"
+
+    def stop(self) -> None:
+        """End the process; harmless if it has ended or was never started."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        process.terminate()
+        try:
+            process.wait(_STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        finally:
+            if process.stdout is not None:
+                process.stdout.close()
+
+    def _wait_until_ready(self, process: subprocess.Popen[bytes]) -> dict[str, Any]:
+        assert process.stdout is not None
+        deadline = time.monotonic() + _READY_TIMEOUT_S
+        line = b""
+        while not line.endswith(b"\n"):
+            left_s = deadline - time.monotonic()
+            if left_s <= 0 or not select.select([process.stdout], [], [], left_s)[0]:
+                raise LinkUnavailable(f"{self._module} was not ready after {_READY_TIMEOUT_S} s: {self._log_tail()}")
+            data = os.read(process.stdout.fileno(), 65536)
+            if not data:
+                raise LinkUnavailable(f"{self._module} ended before it was ready: {self._log_tail()}")
+            line += data
+        ready: dict[str, Any] = json.loads(line)
+        return ready
+
+    def _log_tail(self) -> str:
+        try:
+            lines = self._log_path.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        except OSError:
+            lines = []
+        return f"{lines[-1]} (all of it: {self._log_path})" if lines else f"it left nothing in {self._log_path}"
+
+
+def _python_path() -> str:
+    inherited = os.environ.get("PYTHONPATH")
+    return f"{_REPOSITORY}{os.pathsep}{inherited}" if inherited else str(_REPOSITORY)

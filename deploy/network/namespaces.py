@@ -1,0 +1,192 @@
+"""Two network namespaces joined by the packet link: the emulation to trust, for those who may use it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import ClassVar, Self
+
+from deploy.network.conditions import HOSTS, Direction, Host, NetworkConditions
+from deploy.network.errors import LinkFailedError, LinkUnavailable
+from deploy.network.link_process import LinkProcess
+from deploy.network.part import NetworkPart
+
+DEVICE = "net0"
+MTU_BYTES = 1500
+
+_log = logging.getLogger(__name__)
+_NAMESPACES = Path("/var/run/netns")
+_TUN = Path("/dev/net/tun")
+_OWN_NAME = re.compile(r"relod-(\d+)-(?:local|remote)")
+_COMMAND_TIMEOUT_S = 10.0
+
+
+class NamespaceLink:
+    """Each host is a network namespace of its own; a process carries the packets between them.
+
+    The hosts reach each other and themselves, and nothing else: whoever wants to talk to their services has
+    to be started with ``command_prefix`` too. One launcher can hold one such link at a time.
+    """
+
+    addresses: ClassVar[Mapping[Host, str]] = {"local": "10.213.77.1", "remote": "10.213.77.2"}
+    """Address of each host. The same in every run: namespaces do not see each other."""
+
+    def __init__(self, conditions: NetworkConditions, run_dir: Path, seed: int = 0) -> None:
+        self._process = LinkProcess("deploy.network.tun", conditions, run_dir, seed)
+        self._created: list[str] = []
+        self._final_bytes: dict[Direction, int] | None = None
+
+    def __enter__(self) -> Self:
+        require_namespaces()
+        remove_stale_namespaces()
+        try:
+            for host in HOSTS:
+                self._create(host)
+            self._process.start(
+                [
+                    *("--local", str(_NAMESPACES / namespace_name("local"))),
+                    *("--remote", str(_NAMESPACES / namespace_name("remote"))),
+                    *("--device", DEVICE),
+                ]
+            )
+        except BaseException:
+            self._remove()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            # A link that failed may have lost its devices; that must not hide why the run ends.
+            with contextlib.suppress(LinkFailedError):
+                self._final_bytes = self.kernel_bytes()
+        finally:
+            self._remove()
+
+    def listen_address(self, host: Host) -> str:
+        return self.addresses[host]
+
+    def dial_address(self, from_host: Host, to_host: Host, port: int) -> tuple[str, int]:
+        return self.addresses[to_host], port
+
+    def command_prefix(self, host: Host) -> list[str]:
+        return ["ip", "netns", "exec", namespace_name(host)]
+
+    def kernel_bytes(self) -> dict[Direction, int] | None:
+        if not self._created:
+            return self._final_bytes
+        return {"uplink": _sent_bytes("local"), "downlink": _sent_bytes("remote")}
+
+    def part(self) -> NetworkPart:
+        return self._process.part()
+
+    def failure(self) -> str | None:
+        return self._process.failure()
+
+    def _create(self, host: Host) -> None:
+        name = namespace_name(host)
+        other: Host = "remote" if host == "local" else "local"
+        if (_NAMESPACES / name).exists():
+            raise LinkUnavailable(
+                f"the network namespace {name} exists already: this launcher has another link open, "
+                f"or else remove it with: ip netns delete {name}"
+            )
+        self._created.append(name)  # first: an interrupted command may have made it all the same
+        _ip("netns", "add", name)
+        _ip("-n", name, "link", "set", "lo", "up")
+        _ip("-n", name, "tuntap", "add", "dev", DEVICE, "mode", "tun")
+        # Without an IPv6 address the host sends nothing of its own accord: every byte counted is a service's.
+        _ip("-n", name, "link", "set", DEVICE, "mtu", str(MTU_BYTES), "addrgenmode", "none")
+        _ip("-n", name, "addr", "add", self.addresses[host], "peer", self.addresses[other], "dev", DEVICE)
+        _ip("-n", name, "link", "set", DEVICE, "up")
+
+    def _remove(self) -> None:
+        try:
+            self._process.stop()
+        finally:
+            while self._created:
+                _delete(self._created.pop())
+
+
+def namespace_name(host: Host) -> str:
+    """Name of this process's namespace for ``host``."""
+    return f"relod-{os.getpid()}-{host}"
+
+
+def require_namespaces() -> None:
+    """Raise :class:`LinkUnavailable` if this process cannot make network namespaces and TUN devices."""
+    if shutil.which("ip") is None:
+        raise LinkUnavailable("network namespaces need the command 'ip': install iproute2")
+    if not _TUN.exists():
+        raise LinkUnavailable(
+            f"the packet link needs {_TUN}: load the kernel module 'tun', or start the container with "
+            "--device /dev/net/tun --cap-add NET_ADMIN --cap-add SYS_ADMIN"
+        )
+    if os.geteuid() != 0:
+        raise LinkUnavailable("network namespaces need root: run the launcher with sudo, or choose the relay")
+
+
+def remove_stale_namespaces() -> list[str]:
+    """Remove the namespaces of launchers that died before they could; returns their names."""
+    names = [path.name for path in sorted(_NAMESPACES.glob("relod-*"))]
+    stale = [name for name in names if (found := _OWN_NAME.fullmatch(name)) and not _alive(int(found[1]))]
+    for name in stale:
+        _log.info("removing the network namespace %s of a launcher that has died", name)
+        _delete(name)
+    return stale
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+def _delete(name: str) -> None:
+    try:
+        _ip("netns", "delete", name)
+    except LinkUnavailable as error:
+        if (_NAMESPACES / name).exists():  # else another launcher has been faster with a stale one
+            _log.warning("%s", error)
+
+
+def _sent_bytes(host: Host) -> int:
+    try:
+        report = json.loads(_ip("-n", namespace_name(host), "-s", "-j", "link", "show", "dev", DEVICE))
+    except LinkUnavailable as error:
+        raise LinkFailedError(f"the kernel's counters of {host} cannot be read: {error}") from error
+    return int(report[0]["stats64"]["tx"]["bytes"])
+
+
+def _ip(*arguments: str) -> str:
+    command = ["ip", *arguments]
+    try:
+        # A session of its own: Ctrl-C must not interrupt the removal of what has been created.
+        finished = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=_COMMAND_TIMEOUT_S,
+            start_new_session=True,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise LinkUnavailable(f"{' '.join(command)}: {error}") from error
+    if finished.returncode != 0:
+        reason = finished.stderr.strip() or f"exit code {finished.returncode}"
+        hint = "; it takes CAP_SYS_ADMIN and CAP_NET_ADMIN" if "not permitted" in reason else ""
+        raise LinkUnavailable(f"{' '.join(command)}: {reason}{hint}")
+    return finished.stdout

@@ -1,0 +1,109 @@
+"""The services' parts of a run's record, added up over the incarnations of each service."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from common.record import read_parts
+from common.topics import REPLAY, ROBOT_BRIDGE, SERVICES
+
+Part = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class RunParts:
+    """All parts, oldest incarnation first."""
+
+    parts: tuple[Part, ...]
+
+    @classmethod
+    def read(cls, run_dir: Path) -> RunParts:
+        """Return the parts that are there; a service that never got so far has none."""
+        return cls(tuple(part for part in read_parts(run_dir) if part.get("service") in SERVICES))
+
+    def of(self, service: str) -> list[Part]:
+        """The parts of one service."""
+        return [part for part in self.parts if part["service"] == service]
+
+    def newest(self, service: str) -> Part | None:
+        """The part of the newest incarnation."""
+        return next(reversed(self.of(service)), None)
+
+    def latest(self, service: str, counter: str) -> float | None:
+        """A counter that goes on over incarnations: the newest one that was reported."""
+        values = self._values(service, counter)
+        return values[-1] if values else None
+
+    def greatest(self, service: str, counter: str) -> float | None:
+        """A counter that never falls over incarnations."""
+        return max(self._values(service, counter), default=None)
+
+    def total(self, service: str, counter: str) -> float | None:
+        """A counter that begins anew with each incarnation."""
+        values = self._values(service, counter)
+        return sum(values) if values else None
+
+    def bytes_sent(self) -> dict[str, Counter[str]]:
+        """Service -> topic -> payload bytes sent."""
+        sent: dict[str, Counter[str]] = {service: Counter() for service in SERVICES}
+        for part in self.parts:
+            sent[part["service"]].update(part.get("bytes_sent", {}))
+        return sent
+
+    def _values(self, service: str, counter: str) -> list[float]:
+        counters = (part.get("counters", {}) for part in self.of(service))
+        return [values[counter] for values in counters if values.get(counter) is not None]
+
+
+def elapsed_s(parts: RunParts) -> float | None:
+    """From the first start of the bridge to its last word, seconds; the time it was away included."""
+    bridges = parts.of(ROBOT_BRIDGE)
+    if not bridges:
+        return None
+    first, last = bridges[0], bridges[-1]
+    between_s = (int(last["incarnation"]) - int(first["incarnation"])) / 1e9
+    return round(between_s + float(last.get("wall_s", 0.0)), 3)
+
+
+def produced(parts: RunParts) -> int | None:
+    """TimeSteps published, over all incarnations of the bridge.
+
+    The bridge's own count. The last part of one that was killed is up to a second old: what replay knows to have
+    existed is then more.
+    """
+    counts: Counter[str] = Counter()
+    for part in parts.of(ROBOT_BRIDGE):
+        counts[str(part["incarnation"])] = int(part.get("counters", {}).get("produced", 0))
+    if not counts:
+        return None
+    for part in parts.of(REPLAY):  # each knows only what it has seen itself
+        for incarnation, seen in part.get("produced_seen", {}).items():
+            counts[incarnation] = max(counts[incarnation], int(seen))
+    return counts.total()
+
+
+def persisted(parts: RunParts) -> int | None:
+    """Distinct TimeSteps that replay has stored."""
+    counts = newest_detail(parts, REPLAY, "persisted")
+    return None if counts is None else sum(int(count) for count in counts.values())
+
+
+def newest_detail(parts: RunParts, service: str, name: str) -> Any:
+    """A detail as the newest incarnation that knows it says; None if none does."""
+    return next((part[name] for part in reversed(parts.of(service)) if part.get(name) is not None), None)
+
+
+def service_failures(parts: RunParts) -> list[dict[str, Any]]:
+    """Incarnations that failed, or never said that they had stopped."""
+    failures = []
+    for part in parts.parts:
+        failure = part.get("failure")
+        if failure is None and part.get("state") != "stopped":
+            failure = f"last heard of as {part.get('state')!r}: killed, or still running"
+        if failure is not None:
+            failures.append({"service": part["service"], "incarnation": part["incarnation"], "failure": failure})
+    return failures

@@ -1,0 +1,254 @@
+"""``python -m deploy.summary RUN_DIR``: makes ``summary.json`` and ``learning_curve.png`` from the services' parts.
+
+What a run's record does not tell is null in the summary, with a warning: a run that was cut short has one too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from common.errors import ConfigError, RelodError, RingError
+from common.messages import Int64Array
+from common.record import write_atomically
+from common.topics import ACTOR, LEARNER, ROBOT_BRIDGE
+from deploy import parts as run_parts
+from deploy.actions import ArrivedActions, last_published_ns, outage_ends
+from deploy.curve import draw_learning_curve
+from deploy.episodes import Episode, EpisodeTable, steps_per_goal
+from deploy.network import NetworkPart
+from deploy.parts import RunParts
+from deploy.run_file import RunFile
+from deploy.summary_text import summary_text
+from deploy.traffic import bytes_per_key, network_link
+
+
+@dataclass(frozen=True)
+class RingContent:
+    """What the summary wants to know of the experience ring."""
+
+    duplicated: int
+    """Rows whose time step stands in an earlier row."""
+    published_ns: Int64Array
+    """(rows,) publication times of the time steps in the ring."""
+
+
+@dataclass
+class Record:
+    """Everything a run left behind; what is missing is None and has its warning."""
+
+    parts: RunParts
+    run: RunFile | None
+    episodes: list[Episode]
+    actions: ArrivedActions | None
+    ring: RingContent | None
+    network: NetworkPart | None
+    warnings: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The content of ``summary.json`` and what it was drawn from."""
+
+    values: dict[str, Any]
+    warnings: list[str]
+    episodes: list[Episode]
+    has_goal: bool
+    """Whether steps per goal mean something in this run."""
+
+
+def read_record(run_dir: Path) -> Record:
+    """Read a run's record.
+
+    Raises:
+        ConfigError: there is no such folder.
+    """
+    if not run_dir.is_dir():
+        raise ConfigError(f"{run_dir}: no such run directory")
+    warnings: list[str] = []
+
+    def attempt(read: Callable[[], Any]) -> Any:
+        try:
+            return read()
+        except (RelodError, OSError, ValueError, KeyError, TypeError) as error:
+            warnings.append(str(error))
+            return None
+
+    table = EpisodeTable(run_dir)
+    attempt(table.update)
+    actions = attempt(lambda: ArrivedActions.read(run_dir))
+    unreadable = table.unreadable + (actions.unreadable if actions else 0)
+    if unreadable:
+        warnings.append(f"{unreadable} rows of episodes.csv and actions.csv could not be read")
+    return Record(
+        parts=RunParts.read(run_dir),
+        run=attempt(lambda: RunFile.read(run_dir)),
+        episodes=table.episodes,
+        actions=actions,
+        ring=attempt(lambda: read_ring(run_dir / "ring")),
+        network=attempt(lambda: _read_network(run_dir)),
+        warnings=warnings,
+    )
+
+
+def read_ring(path: Path) -> RingContent:
+    """Count what stands twice in the experience ring.
+
+    Raises:
+        RingError: there is none, or it cannot be read.
+    """
+    import numpy as np
+
+    from common.frame_ring import RingReader
+
+    if not path.exists():
+        raise RingError(f"{path} is missing")
+    reader = RingReader(path)
+    try:
+        end = reader.rows_appended
+        rows = reader.read_rows(np.arange(max(0, end - reader.layout.capacity_rows), end))
+    finally:
+        reader.close()
+    identities = rows[["incarnation", "seq"]]
+    return RingContent(len(rows) - len(np.unique(identities)), rows["published_ns"].copy())
+
+
+def summarise(record: Record) -> Summary:
+    """Return the summary of a record."""
+    notes: list[str] = []
+    warnings = list(record.warnings)
+    parts = record.parts
+    bridge = parts.newest(ROBOT_BRIDGE)
+    if bridge is None:
+        warnings.append("the robot_bridge left no part: its counts are missing")
+    run = record.run
+    steps = _count(parts.latest(ROBOT_BRIDGE, "steps"))
+    has_goal = run_parts.newest_detail(parts, ROBOT_BRIDGE, "has_goal")
+    produced, persisted = run_parts.produced(parts), run_parts.persisted(parts)
+    if persisted is None:
+        warnings.append("replay left no count of what it has persisted")
+    values = {
+        "task": run.task if run else run_parts.newest_detail(parts, ROBOT_BRIDGE, "task"),
+        "algorithm": run.algorithm if run else None,
+        "mode": run.mode if run else None,
+        "network": run.network if run else None,
+        "seed": run.seed if run else run_parts.newest_detail(parts, ROBOT_BRIDGE, "seed"),
+        "steps": steps,
+        "acted_steps": _count(parts.latest(ROBOT_BRIDGE, "acted_steps")),
+        "episodes": _count(parts.latest(ROBOT_BRIDGE, "episodes")),
+        "steps_per_goal_last_1000": _steps_per_goal(record.episodes, steps, has_goal, notes),
+        **{
+            name: _count(parts.total(ROBOT_BRIDGE, name))
+            for name in ("cycles", "overruns", "overruns_after_1000", "late_actions")
+        },
+        "experience": {
+            "produced": produced,
+            "persisted": persisted,
+            "lost": None if produced is None or persisted is None else produced - persisted,
+            "duplicated": record.ring.duplicated if record.ring else None,
+            "resent": _sum(parts.total(ROBOT_BRIDGE, "resent"), parts.total(ACTOR, "resent")),
+        },
+        "updates": _count(parts.greatest(LEARNER, "updates")),
+        "policy_pushes": _count(parts.total(LEARNER, "policy_pushes")),
+        "policy_version": _count(parts.greatest(LEARNER, "policy_version")),
+        "observation_to_action_ms": record.actions.observation_to_action_ms() if record.actions else None,
+        "outages": _outages(record, notes),
+        "bytes_per_key": bytes_per_key(parts.bytes_sent()),
+        "wall_s": run_parts.elapsed_s(parts),
+        "network_link": _network_link(record),
+        "service_failures": run_parts.service_failures(parts),
+        "notes": notes,
+    }
+    return Summary(values, warnings, record.episodes, bool(has_goal))
+
+
+def write_summary(run_dir: Path, summary: Summary) -> Path:
+    """Write ``summary.json``; return its path."""
+    path = run_dir / "summary.json"
+    write_atomically(path, json.dumps(summary.values, indent=1) + "\n")
+    return path
+
+
+def write_curve(run_dir: Path, summary: Summary) -> Path:
+    """Draw ``learning_curve.png``; return its path."""
+    path, values = run_dir / "learning_curve.png", summary.values
+    facts = [values["task"] or run_dir.name, values["mode"]]
+    facts += [f"{name} {values[name]}" for name in ("network", "seed") if values[name] is not None]
+    title = ", ".join(str(fact) for fact in facts if fact is not None)
+    draw_learning_curve(path, summary.episodes, values["steps"] or 0, summary.has_goal, title)
+    return path
+
+
+def _steps_per_goal(
+    episodes: Sequence[Episode], steps: int | None, has_goal: bool | None, notes: list[str]
+) -> float | None:
+    if not has_goal or not steps:
+        return None
+    value = steps_per_goal(episodes, steps)
+    if value is None:
+        notes.append("steps_per_goal_last_1000 is null: no goal was reached in the last 1000 steps")
+        return None
+    return round(value, 3)
+
+
+def _outages(record: Record, notes: list[str]) -> list[dict[str, float | None]] | None:
+    if record.network is None or record.actions is None:
+        # Without a network there are none; with one whose actions are unknown, nobody can say.
+        return [] if record.run is not None and record.run.backend == "none" else None
+    last_ns = last_published_ns(record.actions, record.ring.published_ns if record.ring else [])
+    ends = outage_ends(record.actions, record.network, last_ns)
+    if any(end.first_action_s is None for end in ends):
+        notes.append("first_action_s is null where the run ended before an action came")
+    return [end.to_table() for end in ends]
+
+
+def _network_link(record: Record) -> dict[str, Any] | None:
+    if record.network is None or record.run is None:
+        return None
+    return network_link(record.run.backend, record.network, record.parts.bytes_sent(), record.run.placement)
+
+
+def _read_network(run_dir: Path) -> NetworkPart | None:
+    path = run_dir / "network.json"
+    # A run on one host has no network, and misses nothing.
+    return NetworkPart.read(path) if path.exists() else None
+
+
+def _count(value: float | None) -> int | None:
+    return None if value is None else round(value)
+
+
+def _sum(*values: float | None) -> int | None:
+    known = [value for value in values if value is not None]
+    return round(sum(known)) if known else None
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Summarise a run from the command line."""
+    parser = argparse.ArgumentParser(prog="python -m deploy.summary", description="Summarise a run's record.")
+    parser.add_argument("run_dir", type=Path, metavar="RUN_DIR", help="folder of the run's record")
+    options = parser.parse_args(arguments)
+    try:
+        summary = summarise(read_record(options.run_dir))
+        paths = [write_summary(options.run_dir, summary), write_curve(options.run_dir, summary)]
+    except RelodError as error:
+        print(f"deploy.summary: error: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"deploy.summary: error: {options.run_dir}: cannot be written: {error.strerror}", file=sys.stderr)
+        return 1
+    for warning in summary.warnings:
+        print(f"deploy.summary: warning: {warning}", file=sys.stderr)
+    print(summary_text(summary.values))
+    for path in paths:
+        print(path)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

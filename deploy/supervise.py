@@ -1,0 +1,142 @@
+"""Starts the services of a run, notices who dies and who comes back, and stops them in order."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from common.topics import LEARNER, ROBOT_BRIDGE
+from deploy.child import Child, LaunchedService, exit_text
+from deploy.run_file import REPOSITORY
+
+_LOOK_FOR_RETURN_S = 0.5
+_POLL_S = 0.02
+
+
+@dataclass(frozen=True)
+class StopTimes:
+    """When what happens after Ctrl-C, seconds; all processes have to be gone within 5."""
+
+    rest_after_s: float = 1.5
+    """The bridge stops the robot and tells the others that the run is over; who runs now is told by a signal."""
+    kill_after_s: float = 3.5
+    """Who runs now is killed."""
+
+
+class Supervisor:
+    """The four processes of a run."""
+
+    def __init__(
+        self,
+        services: Iterable[LaunchedService],
+        run_dir: Path,
+        report: Callable[[str], None],
+        run_has_begun: Callable[[], bool] = lambda: True,
+        stop_times: StopTimes = StopTimes(),
+    ) -> None:
+        """Args:
+        services: what to start.
+        run_dir: folder of the run's record.
+        report: tells the user at once.
+        run_has_begun: True once the run has made a step; until then a service that fails has failed to start.
+        stop_times: of :meth:`stop`.
+        """
+        self.children = {service.name: Child(service, run_dir) for service in services}
+        self.cannot_start = False
+        """A service failed before the run had begun: waiting for it makes no sense."""
+        self._report = report
+        self._run_has_begun = run_has_begun
+        self._stop_times = stop_times
+        self._next_look_s = 0.0
+        self._seen_end: set[str] = set()
+        self._seen_end_by_hand: set[int] = set()
+
+    def start(self, asked_to_stop: Callable[[], bool] = lambda: False) -> None:
+        """Start all services, unless asked to stop in between."""
+        for child in self.children.values():
+            if asked_to_stop():
+                return
+            child.start()
+
+    @property
+    def running(self) -> bool:
+        """True while any service runs, whoever has started it."""
+        return any(child.alive for child in self.children.values())
+
+    @property
+    def failed(self) -> list[str]:
+        """Services that died and never returned, or whose last incarnation failed."""
+        return [child.name for child in self.children.values() if not child.ended_well]
+
+    def check(self) -> None:
+        """Report who has died and who has returned since the last call."""
+        for child in self.children.values():
+            code = child.exit_code
+            if code is not None and child.name not in self._seen_end:
+                self._seen_end.add(child.name)
+                self._note_end(child, code)
+        now_s = time.monotonic()
+        if now_s >= self._next_look_s:
+            self._next_look_s = now_s + _LOOK_FOR_RETURN_S
+            for child in self.children.values():
+                if child.name in self._seen_end:
+                    self._look_for_return(child)
+
+    def stop(self, begun_s: float) -> None:
+        """Stop all services in order; ``begun_s`` is when the user asked for it, monotonic.
+
+        First the bridge, which stops the robot and tells the others that the run is over. Then who is still there,
+        the learner last, because the others' last data are for it. Then force.
+        """
+        bridge = self.children.get(ROBOT_BRIDGE)
+        rest_s = begun_s + self._stop_times.rest_after_s
+        if bridge is not None and bridge.alive:
+            bridge.signal(signal.SIGINT)
+        else:
+            rest_s = begun_s  # nobody will tell them
+        self._wait_until(rest_s)
+        for child in sorted(self.children.values(), key=lambda child: child.name == LEARNER):
+            if child.name != ROBOT_BRIDGE:
+                child.signal(signal.SIGINT)
+        self._wait_until(begun_s + self._stop_times.kill_after_s)
+        for child in self.children.values():
+            if child.alive:
+                self._report(f"{child.name} has not ended in time and is killed")
+                child.signal(signal.SIGKILL)
+        self._wait_until(begun_s + self._stop_times.kill_after_s + 0.5)
+
+    def _wait_until(self, deadline_s: float) -> None:
+        while self.running and time.monotonic() < deadline_s:
+            for child in self.children.values():
+                if child.by_hand is not None:
+                    child.newer_incarnation()  # refreshes what it says of itself
+            time.sleep(_POLL_S)
+
+    def _note_end(self, child: Child, code: int) -> None:
+        if code == 0:
+            return
+        child.died = True
+        lines = [f"{child.name} has died: {exit_text(code)}"]
+        lines += [f"  {line}" for line in child.reason().splitlines() if code != -signal.SIGKILL]
+        lines += [f"  log: {child.console}"]
+        if code > 0 and not self._run_has_begun():
+            self.cannot_start = True
+            lines += ["  it could not start, so the run ends"]
+        else:
+            lines += [f"  the others go on; start it again, in {REPOSITORY}:", f"  {child.service.command_line()}"]
+        self._report("\n".join(lines))
+
+    def _look_for_return(self, child: Child) -> None:
+        if child.newer_incarnation():
+            assert child.by_hand is not None
+            self._report(f"{child.name} has returned (process {child.by_hand.get('pid')})")
+        part = child.by_hand
+        if part is None or child.alive or part["incarnation"] in self._seen_end_by_hand:
+            return
+        self._seen_end_by_hand.add(part["incarnation"])
+        if not child.ended_well:
+            reason = part.get("failure") or "killed"
+            self._report(f"{child.name} has died again: {reason}\n  {child.service.command_line()}")

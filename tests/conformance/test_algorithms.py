@@ -1,0 +1,159 @@
+"""What every algorithm of the table promises to the learner."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from common.algorithms import ALGORITHMS, load_algorithm
+from common.algorithms.base import Algorithm
+from common.algorithms.presets import PRESETS
+from common.errors import ConfigError
+from common.policies import policy_from_weights
+from tests.reference.tasks import make_minibatch, make_observation, make_spec
+
+SPECS = {"no camera": make_spec(), "camera": make_spec((32, 36, 3))}
+
+
+@pytest.fixture(params=ALGORITHMS)
+def name(request):
+    return request.param
+
+
+@pytest.fixture(params=SPECS)
+def spec(request):
+    return SPECS[request.param]
+
+
+def make_algorithm(name, spec, seed=0, hidden_size=16):
+    preset = next(iter(PRESETS[name].values()))
+    config = replace(preset, hidden_size=hidden_size, encoder_strides=(2, 2, 1, 1))
+    return load_algorithm(name)(spec, config, seed=seed)
+
+
+def minibatches(spec, count, seed=0):
+    rng = np.random.default_rng(seed)
+    return [make_minibatch(spec, rng) for _ in range(count)]
+
+
+def stored_and_loaded(state):
+    """Return the state after a trip through a file that may not contain pickles."""
+    file = io.BytesIO()
+    np.savez(file, **state)
+    file.seek(0)
+    with np.load(file, allow_pickle=False) as loaded:
+        return {key: loaded[key] for key in loaded.files}
+
+
+def assert_equal_states(one, other):
+    assert one.keys() == other.keys()
+    for key in one:
+        np.testing.assert_array_equal(one[key], other[key], err_msg=key)
+        assert one[key].dtype == other[key].dtype, key
+
+
+def test_it_implements_the_interface(name, spec):
+    assert issubclass(load_algorithm(name), Algorithm)
+    assert make_algorithm(name, spec).updates == 0
+
+
+def test_equal_seeds_learn_equally_and_others_do_not(name, spec):
+    one, same, other = (make_algorithm(name, spec, seed) for seed in (3, 3, 4))
+    for minibatch in minibatches(spec, 3):
+        for algorithm in (one, same, other):
+            algorithm.update(minibatch)
+    assert_equal_states(one.state_dict(), same.state_dict())
+    different = one.state_dict(), other.state_dict()
+    assert any(not np.array_equal(different[0][key], different[1][key]) for key in different[0])
+
+
+def test_updates_after_a_checkpoint_are_bit_identical(name, spec):
+    original, resumed = make_algorithm(name, spec, seed=0), make_algorithm(name, spec, seed=1)
+    before, after = minibatches(spec, 3), minibatches(spec, 3, seed=9)
+    for minibatch in before:
+        original.update(minibatch)
+    resumed.load_state_dict(stored_and_loaded(original.state_dict()))
+    assert resumed.updates == 3
+    assert_equal_states(original.state_dict(), resumed.state_dict())
+    for minibatch in after:
+        original.update(minibatch)
+        resumed.update(minibatch)
+    assert resumed.updates == 6
+    assert_equal_states(original.state_dict(), resumed.state_dict())
+
+
+def test_a_checkpoint_before_the_first_update_is_complete_too(name, spec):
+    original, resumed = make_algorithm(name, spec, seed=0), make_algorithm(name, spec, seed=1)
+    resumed.load_state_dict(stored_and_loaded(original.state_dict()))
+    for minibatch in minibatches(spec, 2):
+        original.update(minibatch)
+        resumed.update(minibatch)
+    assert_equal_states(original.state_dict(), resumed.state_dict())
+
+
+def test_a_state_is_a_copy(name, spec):
+    algorithm = make_algorithm(name, spec)
+    state = algorithm.state_dict()
+    kept = {key: value.copy() for key, value in state.items()}
+    algorithm.update(minibatches(spec, 1)[0])
+    assert_equal_states(state, kept)
+
+
+def test_a_checkpoint_of_another_network_is_refused_and_changes_nothing(name, spec):
+    algorithm = make_algorithm(name, spec)
+    before = algorithm.state_dict()
+    wider = make_algorithm(name, spec, hidden_size=24).state_dict()
+    incomplete = {key: value for key, value in before.items() if not key.endswith("random_state")}
+    for wrong in (wider, incomplete, before | {"surplus": np.zeros(3)}):
+        with pytest.raises(ConfigError, match="checkpoint"):
+            algorithm.load_state_dict(wrong)
+        assert_equal_states(algorithm.state_dict(), before)
+
+
+def test_read_only_minibatches_are_fine_and_none_is_changed(name, spec):
+    algorithm, (minibatch, kept) = make_algorithm(name, spec), minibatches(spec, 1) + minibatches(spec, 1)
+    arrays = {f.name: getattr(minibatch, f.name) for f in fields(minibatch)}
+    for array in arrays.values():
+        if array is not None:
+            array.flags.writeable = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        algorithm.update(minibatch)
+    for key, array in arrays.items():
+        np.testing.assert_array_equal(array, getattr(kept, key))
+
+
+def test_metrics_are_finite_numbers_and_absent_before_the_first_update(name, spec):
+    algorithm = make_algorithm(name, spec)
+    assert algorithm.metrics() == {}
+    algorithm.update(minibatches(spec, 1)[0])
+    metrics = algorithm.metrics()
+    assert metrics
+    assert all(isinstance(value, float) and np.isfinite(value) for value in metrics.values())
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float16"])
+def test_pushed_weights_make_a_policy_that_acts(name, spec, dtype):
+    algorithm = make_algorithm(name, spec)
+    for minibatch in minibatches(spec, 2):
+        algorithm.update(minibatch)
+    weights = algorithm.policy_weights(7, dtype)
+    assert (weights.version, weights.updates, weights.algorithm, weights.dtype) == (7, 2, name, dtype)
+    policy, rng = policy_from_weights(spec, weights), np.random.default_rng(0)
+    assert policy.version == 7
+    chosen = policy.act(make_observation(spec, rng), rng)
+    assert chosen.action.shape == spec.action_low.shape
+    assert np.isfinite(chosen.action).all()
+    assert np.isfinite(chosen.log_probability)
+
+
+def test_pushed_weights_do_not_change_with_later_updates(name, spec):
+    algorithm = make_algorithm(name, spec)
+    weights = algorithm.policy_weights(1, "float32")
+    kept = weights.buffer.copy()
+    algorithm.update(minibatches(spec, 1)[0])
+    np.testing.assert_array_equal(weights.buffer, kept)

@@ -1,0 +1,40 @@
+"""The launcher's output: a status line that is rewritten in a terminal, and sparse elsewhere."""
+
+import io
+import os
+
+from deploy.console import PLAIN_PERIOD_S, Console
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_s_status_line_is_rewritten_and_makes_room() -> None:
+    out, errors = Terminal(), io.StringIO()
+    console = Console(out, errors)
+    console.status("one")
+    console.status("two")
+    console.error("replay has died")
+    assert out.getvalue() == "\rone\x1b[K\rtwo\x1b[K\r\x1b[K"
+    assert errors.getvalue() == "replay has died\n"
+
+
+def test_elsewhere_the_status_is_a_line_now_and_then() -> None:
+    now_s = 0.0
+    out = io.StringIO()
+    console = Console(out, io.StringIO(), now_s=lambda: now_s)
+    for now_s in (0.0, 1.0, PLAIN_PERIOD_S + 1.0, PLAIN_PERIOD_S + 2.0):
+        console.status(f"at {now_s:g}")
+    console.line("end")
+    assert out.getvalue() == "at 0\nat 11\nend\n"
+
+
+def test_a_reader_who_has_left_is_no_error() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as out:
+        console = Console(out, io.StringIO())
+        console.line("nobody reads this")
+        console.line("nor this")
