@@ -1,0 +1,127 @@
+"""The launcher over emulated links, and Ctrl-C at any moment."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from common.record import read_parts
+from tests.integration.ring_processes import ROOT, SMALL_AND_FAST, options, wait_until
+
+QUICK_LEARNING = (
+    "algorithm.min_size_to_sample=40",
+    "algorithm.batch_size=8",
+    "algorithm.hidden_size=32",
+    "algorithm.policy_push_interval=20",
+    "algorithm.replay_capacity=2000",
+)
+
+
+def launch(run_dir: Path, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "deploy.launch", *arguments, "--run-dir", str(run_dir)],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def run(run_dir: Path, *arguments: str) -> dict[str, Any]:
+    with launch(run_dir, *arguments) as process:
+        output, _ = process.communicate(timeout=200)
+    assert process.returncode == 0, output
+    summary: dict[str, Any] = json.loads((run_dir / "summary.json").read_text())
+    return summary
+
+
+@pytest.mark.parametrize("mode", ["remote_local", "remote_only"])
+def test_outages_of_a_limited_link_lose_nothing(mode: str, tmp_path: Path) -> None:
+    network = tmp_path / "network.toml"
+    network.write_text('[network]\npreset = "outage"\noutage_every_s = 7.0\noutage_s = 1.0\n')
+    arguments = ("--task", "noise_frames", "--steps", "400", "--network", str(network))
+    summary = run(tmp_path / "run", mode, *arguments, *options(*QUICK_LEARNING))
+    experience = summary["experience"]
+    assert experience["produced"] == experience["persisted"] > 300
+    assert (experience["lost"], experience["duplicated"]) == (0, 0)
+    assert summary["network_link"]["backend"] in ("namespaces", "relay")
+    if mode == "remote_only":
+        assert summary["outages"], "at least one outage should have ended during the run"
+        # The goal is 1.5 s; the slack is for a busy machine.
+        assert all(outage["first_action_s"] <= 3.0 for outage in summary["outages"])
+
+
+@pytest.mark.parametrize("mode", ["remote_local", "remote_only"])
+def test_the_kernel_counts_the_bytes_that_the_record_assigns_to_the_link(mode: str, tmp_path: Path) -> None:
+    arguments = ("--task", "noise_frames", "--steps", "300", "--network", "ideal")
+    summary = run(tmp_path / "run", mode, *arguments, *options(*QUICK_LEARNING))
+    link = summary["network_link"]
+    if link["backend"] != "namespaces":
+        pytest.skip("needs network namespaces: no kernel counters otherwise")
+    assert 1.00 <= link["uplink"]["ratio"] <= 1.10
+    frames = 300 * 160 * 90 * 3
+    crossing, staying = ("timestep", "experience") if mode == "remote_only" else ("experience", "timestep")
+    assert summary["bytes_per_key"][crossing] > 0.9 * frames
+    assert summary["bytes_per_key"][staying] > 0.9 * frames
+    # Each frame crosses once: what stays on one computer is not in the kernel's count.
+    assert link["uplink"]["kernel_bytes"] < 1.3 * frames
+
+
+@pytest.mark.parametrize("when", ["at once", "while starting", "while acting"])
+def test_ctrl_c_ends_everything_and_completes_the_record(when: str, tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    arguments = ("local_only", "--task", "noise_frames", "--steps", "1000000")
+    with launch(run_dir, *arguments, *options(*SMALL_AND_FAST)) as process:
+        if when != "at once":
+            wait_until(lambda: read_parts(run_dir, "robot_bridge"), "the bridge has started")
+        if when == "while acting":
+            wait_until(lambda: read_parts(run_dir, "robot_bridge")[-1]["counters"]["steps"] > 50, "steps are done")
+        pids = [part["pid"] for part in read_parts(run_dir)]
+        pressed = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=60)
+        took_s = time.monotonic() - pressed
+    # Before the interpreter has come to the launcher's first line, the signal simply ends it.
+    assert process.returncode in ((130, -signal.SIGINT) if when == "at once" else (130,)), output
+    # The goal is 5 s; the slack is for a busy machine.
+    assert took_s < 10, output
+    assert not [pid for pid in pids if is_running(pid)]
+    if when != "at once":
+        summary = json.loads((run_dir / "summary.json").read_text())
+        experience = summary["experience"]
+        assert experience["produced"] - experience["persisted"] == experience["lost"]
+        assert experience["duplicated"] == 0
+    if when == "while acting":
+        assert experience["lost"] == 0
+        assert (run_dir / "learning_curve.png").exists()
+
+
+def test_a_dead_service_is_reported_at_once_and_the_exit_code_tells(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    arguments = ("local_only", "--task", "noise_frames", "--steps", "600")
+    with launch(run_dir, *arguments, *options(*SMALL_AND_FAST)) as process:
+        part = wait_until(lambda: read_parts(run_dir, "learner"), "the learner has started")[-1]
+        wait_until(lambda: read_parts(run_dir, "replay")[-1]["counters"].get("rows", 0) > 0, "experience is kept")
+        os.kill(part["pid"], signal.SIGKILL)
+        output, _ = process.communicate(timeout=120)
+    assert process.returncode == 1, output
+    assert "learner" in output and "SIGKILL" in output
+    assert "python -m services.learner --config" in output.replace(sys.executable, "python")
+    summary = json.loads((run_dir / "summary.json").read_text())
+    assert summary["experience"]["lost"] == 0
+
+
+def is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
