@@ -13,7 +13,7 @@ python = .venv/bin/python
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test check format environment lock clean
+.PHONY: help demo test check soak format environment lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -33,6 +33,9 @@ check: environment ## format, lint, types and import rules; edits nothing
 
 test: environment ## run every test
 	$(python) -m pytest
+
+soak: environment ## run for 21 minutes; fail if memory or open files grow
+	$(python) -m benchmarks.soak
 
 format: environment ## format the code and fix what the linter can
 	$(python) -m ruff check --fix --exit-zero .

@@ -7,6 +7,7 @@ the tables a service adds rows to.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
@@ -14,6 +15,7 @@ import logging
 import os
 import queue
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,10 +39,11 @@ def read_parts(directory: Path, service: str = "*") -> list[dict[str, Any]]:
     parts = []
     for path in directory.glob(f"parts/{service}-*.json"):
         try:
-            parts.append(json.loads(path.read_text(encoding="utf-8")))
-        except (OSError, json.JSONDecodeError) as error:
-            logger.warning("%s: left out of the record: %s", path, error)
-    return sorted(parts, key=lambda part: int(part.get("incarnation", 0)))
+            part = json.loads(path.read_text(encoding="utf-8"))
+            parts.append((int(part["incarnation"]), part))
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            logger.warning("%s: left out of the record: %r", path, error)
+    return [part for _, part in sorted(parts, key=lambda item: item[0])]
 
 
 @dataclass
@@ -60,7 +63,7 @@ class RunRecord:
         self._service, self._incarnation = service, incarnation
         self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(_QUEUE_LENGTH)
         self._tables: dict[str, _Table] = {}
-        self._tensorboard: Any = None
+        self._events: Any = None
         self._thread = threading.Thread(target=self._run, name="record", daemon=True)
 
     def start(self) -> None:
@@ -70,8 +73,10 @@ class RunRecord:
     def close(self, timeout_s: float = 3.0) -> None:
         """Write what is queued, then stop; gives up after ``timeout_s``."""
         if self._thread.is_alive():
-            self._put(None)
-            self._thread.join(timeout_s)
+            deadline = time.monotonic() + timeout_s
+            with contextlib.suppress(queue.Full):
+                self._queue.put(None, timeout=timeout_s)
+            self._thread.join(max(0.0, deadline - time.monotonic()))
 
     def part(self, values: Mapping[str, Any]) -> None:
         """Replace this incarnation's part."""
@@ -97,16 +102,19 @@ class RunRecord:
 
     def _run(self) -> None:
         while (entry := self._queue.get()) is not None:
-            try:
-                entry()
-            except OSError as error:
-                self.dropped += 1
-                if self.dropped == 1:
-                    logger.error("%s: the record cannot be written: %s", self.directory, error)
+            self._write(entry)
         for table in self._tables.values():
-            table.file.close()
-        if self._tensorboard:
-            self._tensorboard.close()
+            self._write(table.file.close)
+        if self._events:
+            self._write(self._events.close)
+
+    def _write(self, entry: Callable[[], None]) -> None:
+        try:
+            entry()
+        except OSError as error:
+            self.dropped += 1
+            if self.dropped == 1:
+                logger.error("%s: the record cannot be written: %s", self.directory, error)
 
     def _write_row(self, table: str, row: Mapping[str, Any]) -> None:
         if table not in self._tables or not row.keys() <= set(self._tables[table].columns):
@@ -139,10 +147,20 @@ class RunRecord:
 
     def _write_metrics(self, step: int, row: Mapping[str, float]) -> None:
         self._write_row(f"metrics/{self._service}", row)
-        if self._tensorboard is None:
-            from tensorboardX import SummaryWriter
+        self._write_event(step, {name: row[name] for name in row if name not in ("incarnation", "step")})
 
-            self._tensorboard = SummaryWriter(str(self.directory / "tensorboard" / self._service))
-        for name, value in row.items():
-            if name not in ("incarnation", "step"):
-                self._tensorboard.add_scalar(f"{self._service}/{name}", value, step)
+    def _write_event(self, step: int, values: Mapping[str, float]) -> None:
+        """Append points to TensorBoard's file; a SummaryWriter would import torch, and die of a full disk."""
+        from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.compat.proto.summary_pb2 import Summary
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        if self._events is None:
+            path = self.directory / "tensorboard" / self._service / f"events.out.tfevents.{self._incarnation}"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._events = RecordWriter(path.open("wb"))
+            self._events.write(Event(wall_time=time.time(), file_version="brain.Event:2").SerializeToString())
+        points = [Summary.Value(tag=f"{self._service}/{name}", simple_value=values[name]) for name in values]
+        event = Event(wall_time=time.time(), step=step, summary=Summary(value=points))
+        self._events.write(event.SerializeToString())
+        self._events.flush()

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from common import topics
 from common.clock import Clock, SystemClock
@@ -39,6 +39,8 @@ GONE_AFTER_S = 1.5
 """A peer whose last status is older than this counts as gone."""
 DRAIN_TIMEOUT_S = 30.0
 """Longest time a service waits at the end for messages that are still on their way."""
+CLOSE_TIMEOUT_S = 1.0
+"""Longest time that leaving the mesh may take."""
 STOP_TIMEOUT_S = 2.0
 """The same when it was asked to stop (Ctrl-C)."""
 
@@ -127,7 +129,10 @@ class Service:
         self._send_status()
         self._write_record()
         self.record.close()
-        self.transport.close()
+        # Zenoh tries for long to say goodbye over a dead link; nobody is there who could hear it.
+        closing = threading.Thread(target=self.transport.close, name="close", daemon=True)
+        closing.start()
+        closing.join(CLOSE_TIMEOUT_S)
 
     @property
     def finished(self) -> Finished | None:
@@ -203,7 +208,8 @@ class Service:
             work()
             if is_drained():
                 self.state = "drained"
-                if all(state in ("drained", "gone", "stopped") for state in self._peer_states().values()):
+                # One that is only starting has nothing yet that could be lost.
+                if all(state in ("starting", "drained", "gone") for state in self._peer_states().values()):
                     return True
             with self.wake:
                 self.wake.wait(0.02)
@@ -321,6 +327,13 @@ def run_service(
         return 1
     finally:
         logging.shutdown()
+
+
+def end_process(exit_code: int) -> NoReturn:
+    """End at once: torch takes seconds to be torn down, and a session in a dead network for ever."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(exit_code)
 
 
 def _run(name: str, config: Any, serve: Callable[[Service, Any], None]) -> int:

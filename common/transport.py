@@ -4,7 +4,8 @@ This is the only file that imports zenoh. Both transports pass the same conforma
 
 * callbacks run on a receiving thread: they enqueue and return, nothing else (a slow one stalls every priority);
 * ``put`` never waits for the network, except on a ``CACHED`` topic, which wants a thread of its own;
-* a query that nobody answers returns None after its time-out.
+* ``put`` on a closed transport is a :class:`~common.errors.TransportError`;
+* a query that nobody answers returns None, at the latest after its time-out.
 """
 
 from __future__ import annotations
@@ -116,7 +117,14 @@ class ZenohTransport:
                 express=topic.urgent,
             )
         self._declared.append(publisher)
-        return _CountingPublisher(topic.name, publisher.put, self.bytes_sent, self._count_lock)
+
+        def put(payload: bytes) -> None:
+            try:
+                publisher.put(payload)
+            except zenoh.ZError as error:
+                raise TransportError(f"put on {key}: {_first_line(error)}") from error
+
+        return _CountingPublisher(topic.name, put, self.bytes_sent, self._count_lock)
 
     def subscribe(self, topic: Topic, callback: PayloadCallback, *, any_run: bool = False) -> None:
         zenoh, session = self._zenoh, self._sessions[topic.lane]
@@ -178,6 +186,8 @@ class ZenohTransport:
             "listen/exit_on_failure": True,
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
+            # Opening would wait this long (ms) for peers to be found, though nobody looks for any.
+            "scouting/delay": 0,
             # With it on, services in two network namespaces exchange data around the emulated link.
             "transport/shared_memory/enabled": settings.shared_memory,
             "transport/link/tx/lease": LEASE_MS,
@@ -219,7 +229,7 @@ class InMemoryNetwork:
         self.drops = drops or (lambda topic, payload: False)
         self.lock = threading.RLock()
         self.subscribers: dict[str, list[tuple[re.Pattern[str], PayloadCallback]]] = defaultdict(list)
-        self.cache: dict[str, bytes] = {}
+        self.cache: dict[str, tuple[object, bytes]] = {}
         self.answers: dict[str, tuple[object, Answer]] = {}
 
     def transport(self, run: RunSettings) -> InMemoryTransport:
@@ -247,7 +257,7 @@ class InMemoryTransport:
                 raise TransportError(f"put on {key}: the session is closed")
             with self._network.lock:
                 if topic.delivery is Delivery.CACHED:
-                    self._network.cache[key] = payload
+                    self._network.cache[key] = (self, payload)
                 listeners = [c for pattern, c in self._network.subscribers[topic.name] if pattern.fullmatch(key)]
             if not self._network.drops(topic, payload):
                 for callback in listeners:
@@ -269,7 +279,7 @@ class InMemoryTransport:
             self._network.subscribers[topic.name].append((pattern, receive))
             cached = self._network.cache.get(key) if topic.delivery is Delivery.CACHED else None
         if cached is not None:
-            receive(cached)
+            receive(cached[1])
 
     def serve(self, topic: Topic, answer: Answer) -> None:
         with self._network.lock:
@@ -287,10 +297,12 @@ class InMemoryTransport:
             for name, listeners in network.subscribers.items():
                 network.subscribers[name] = [item for item in listeners if item not in self._own]
             network.answers = {key: item for key, item in network.answers.items() if item[0] is not self}
+            network.cache = {key: item for key, item in network.cache.items() if item[0] is not self}
 
 
 def _checked_endpoint(endpoint: str) -> str:
-    if not re.fullmatch(r"tcp/(\[[0-9a-fA-F:]+\]|[^\s:/]+):\d{1,5}", endpoint):
+    parts = re.fullmatch(r"tcp/(?:\[[0-9a-fA-F:]+\]|[^\s:/]+):(\d{1,5})", endpoint, re.ASCII)
+    if not parts or not 1 <= int(parts[1]) <= 65535:
         raise TransportError(f"endpoint {endpoint!r}: expected tcp/ADDRESS:PORT, for example tcp/127.0.0.1:7450")
     return endpoint
 

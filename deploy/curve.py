@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -41,11 +42,13 @@ def sliding_steps_per_goal(
     return at, np.where(counts > 0, widths / np.maximum(counts, 1), np.nan)
 
 
-def draw_learning_curve(path: Path, episodes: Sequence[Episode], steps: int, has_goal: bool, title: str) -> None:
-    """Draw the curve of a run to ``path``.
+def draw_learning_curve(
+    to: Path | BinaryIO, episodes: Sequence[Episode], steps: int, has_goal: bool, title: str
+) -> None:
+    """Draw the curve of a run.
 
     Args:
-        path: a PNG file.
+        to: a PNG file.
         episodes: the completed ones, oldest first.
         steps: of the run.
         has_goal: whether steps per goal mean something.
@@ -64,7 +67,7 @@ def draw_learning_curve(path: Path, episodes: Sequence[Episode], steps: int, has
     axes[0].set_title(title)
     axes[-1].set_xlabel("steps of the run, resets included")
     axes[-1].set_xlim(0, max(steps, 1))
-    figure.savefig(path, metadata={"Title": title})
+    figure.savefig(to, format="png", metadata={"Title": title})
 
 
 def _draw_returns(axes: Axes, episodes: Sequence[Episode]) -> None:
@@ -93,3 +96,8 @@ def _draw_steps_per_goal(axes: Axes, episodes: Sequence[Episode], steps: int) ->
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_ylabel(f"steps per goal\n(last {GOAL_WINDOW_STEPS} steps)")
     axes.grid(alpha=0.3, which="both")
+
+
+def load_drawing() -> None:
+    """Import and set up what curves are drawn with, by drawing one: seconds of work, the first time on a computer."""
+    draw_learning_curve(io.BytesIO(), [], 0, has_goal=True, title="")

@@ -25,8 +25,7 @@ from common.policies import Observation, Policy, policy_from_weights
 from common.record import write_atomically
 from common.topics import ROBOT_BRIDGE
 from deploy.console import Console
-from deploy.launch import INTERRUPTED
-from deploy.stop_signals import StopSignals
+from deploy.stop_signals import INTERRUPTED, StopSignals
 from services.robot_bridge.bookkeeping import STEP_REWARD_IN_RESET, Ledger
 from services.robot_bridge.config import RobotBridgeConfig
 from services.robot_bridge.tasks import Task, load_task
@@ -50,7 +49,7 @@ class EvaluatedEpisode:
 
 
 @dataclass(frozen=True)
-class _Step:
+class _StepIdentity:
     """What the frame stack wants to know of a time step."""
 
     incarnation: int
@@ -124,7 +123,7 @@ class Evaluation:
         spec, reading = self._task.spec, self._task.read()
         frames = None
         if self._stack:
-            step = _Step(0, self._seq, self._ledger.attempt, self._ledger.step_index)
+            step = _StepIdentity(0, self._seq, self._ledger.attempt, self._ledger.step_index)
             stack = self._stack.add(step, reading.frame_ids.tolist(), list(reading.frames))
             frames = np.stack(stack.frames) if stack else None
         self._seq += 1

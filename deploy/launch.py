@@ -6,232 +6,45 @@ reported at once, with the command that brings it back; the others go on.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
-import shlex
 import sys
-import threading
-import time
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from typing import NoReturn
 
-import tomli_w
-
-from common.config import to_tables
-from common.errors import ConfigError, RelodError
-from common.topics import LEARNER, ROBOT_BRIDGE, SERVICES
-from deploy.child import LaunchedService
-from deploy.console import Console
-from deploy.network import NetworkLink, NoLink, open_link
-from deploy.options import NO_NETWORK, LaunchOptions, parse_options
-from deploy.plan import PORTS, PortMap, crossings, plan_run, service_command
-from deploy.ports import reserved_ports
-from deploy.progress import Progress, ProgressReader, progress_line
-from deploy.run_file import RunFile, versions
+from common.errors import RelodError
 from deploy.stop_signals import StopSignals
-from deploy.summary import read_record, summarise, write_curve, write_summary
-from deploy.summary_text import summary_text
-from deploy.supervise import Supervisor
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
-_POLL_S = 0.05
-_PROGRESS_S = 1.0
-_CURVE_UNTIL_S = 4.3
-"""After Ctrl-C: from here on there is no time left to wait for the drawing library."""
-
-
-def service_environment(service: str) -> dict[str, str]:
-    """Variables a service is started with, beside the user's own."""
-    # Threads that spin while they wait would take the cores from the other services.
-    environment = {"OMP_WAIT_POLICY": "PASSIVE", "PYTHONUNBUFFERED": "1"}
-    if service != LEARNER:
-        # For what these compute, threads cost a hundred times what they bring.
-        environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    return environment
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run from the command line; return the exit code."""
     logging.basicConfig(level=logging.WARNING, format="deploy.launch: %(message)s")
-    try:
-        with StopSignals() as stop:
+    with StopSignals() as stop:
+        # Imported only now, because it takes a moment in which Ctrl-C should be heard.
+        from deploy.console import Console
+        from deploy.options import parse_options
+        from deploy.run import launch, write_configurations
+
+        try:
             options = parse_options(arguments)
             if options.write_config:
                 return write_configurations(options, options.write_config)
             return launch(options, stop, Console())
-    except RelodError as error:
-        print(f"deploy.launch: error: {error}", file=sys.stderr)
-    except OSError as error:
-        print(f"deploy.launch: error: {error.filename or 'system'}: {error.strerror}", file=sys.stderr)
+        except RelodError as error:
+            print(f"deploy.launch: error: {error}", file=sys.stderr)
+        except OSError as error:
+            print(f"deploy.launch: error: {error.filename or 'system'}: {error.strerror}", file=sys.stderr)
     return 1
 
 
-def write_configurations(options: LaunchOptions, directory: Path) -> int:
-    """Write the configurations for services that a user starts by hand on this computer."""
-    request = options.request
-    if (request.run_dir / "parts").exists():
-        raise ConfigError(f"--run-dir {request.run_dir}: holds the record of a run already; choose another")
-    with reserved_ports(PORTS, options.base_port) as ports:
-        configurations = plan_run(request, PortMap(ports), NoLink(), None)
-    paths = _write_tables(directory, configurations)
-    _run_file(options, configurations, NoLink()).write(request.run_dir)
-    for path in paths.values():
-        print(f"wrote {path}")
-    if request.placement.spans_hosts:
-        print(
-            "All addresses are 127.0.0.1: without the launcher there is no emulated network. For two computers, "
-            "put their addresses in the files."
-        )
-    print(f"The run's record will be in {request.run_dir}")
-    print("Start each service in a terminal of its own, in any order:")
-    for service, path in paths.items():
-        print(f"  {shlex.join(service_command(service, _shortened(path), str(_shortened(Path(sys.executable)))))}")
-    return 0
-
-
-def launch(options: LaunchOptions, stop: StopSignals, console: Console) -> int:
-    """Start the services, watch them until the run is over, summarise; return the exit code."""
-    request = options.request
-    run_dir = request.run_dir
-    if run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
-        raise ConfigError(f"--run-dir {run_dir}: expected a folder that is empty or not there yet")
-    with reserved_ports(PORTS, options.base_port) as ports:
-        port_map = PortMap(ports)
-        # Once without the network: a wrong setting is told before anything is opened or written.
-        plan_run(request, port_map, NoLink(), options.conditions)
-        run_dir.mkdir(parents=True, exist_ok=True)
-        needs = crossings(request.placement, port_map)
-        with open_link(options.conditions, needs=needs, run_dir=run_dir, seed=request.seed or 0) as link:
-            configurations = plan_run(request, port_map, link, options.conditions)
-            paths = _write_tables(run_dir / "config", configurations)
-            _run_file(options, configurations, link).write(run_dir)
-            services = [
-                LaunchedService(
-                    service,
-                    (*link.command_prefix(request.placement.host[service]), *service_command(service, path)),
-                    service_environment(service),
-                )
-                for service, path in paths.items()
-            ]
-            console.line(f"run directory: {run_dir}")
-            steps_total = configurations[ROBOT_BRIDGE].robot_bridge.steps
-            succeeded = _watch(services, ProgressReader(run_dir, steps_total), run_dir, link, stop, console)
-    # The link has been closed: its part of the record is final.
-    complete = _summarise(run_dir, stop, console)
-    if stop.asked:
-        return INTERRUPTED
-    return 0 if succeeded and complete else 1
-
-
-def _watch(
-    services: Sequence[LaunchedService],
-    reader: ProgressReader,
-    run_dir: Path,
-    link: NetworkLink,
-    stop: StopSignals,
-    console: Console,
-) -> bool:
-    """Run the services to their end; True if all has gone well."""
-    progress = Progress(dict.fromkeys(SERVICES, "-"))
-    supervisor = Supervisor(services, run_dir, console.error, run_has_begun=lambda: reader.read().steps > 0)
-    link_failure: str | None = None
-    try:
-        supervisor.start(lambda: stop.asked)
-        # After the services have been started: a launcher without threads can be forked without harm.
-        threading.Thread(target=_load_drawing, name="load drawing", daemon=True).start()
-        next_progress_s = time.monotonic()
-        while supervisor.running and not stop.asked and not supervisor.cannot_start:
-            supervisor.check()
-            if link_failure is None and (link_failure := link.failure()):
-                console.error(f"the emulated network has failed, nothing crosses it any more: {link_failure}")
-            if time.monotonic() >= next_progress_s:
-                next_progress_s = time.monotonic() + _PROGRESS_S
-                progress = reader.read()
-                console.status(progress_line(progress))
-            time.sleep(_POLL_S)
-        if not stop.asked:
-            supervisor.check()
-    finally:
-        # Also when this program has an error: nothing may be left running.
-        if supervisor.running:
-            asked_s = stop.asked_s if stop.asked_s is not None else time.monotonic()
-            console.line("stopping the services")
-            supervisor.stop(asked_s)
-    console.line(progress_line(reader.read()))
-    if not stop.asked and supervisor.failed:
-        console.error(f"not well at the end: {', '.join(supervisor.failed)}")
-    return not supervisor.failed and link_failure is None
-
-
-def _summarise(run_dir: Path, stop: StopSignals, console: Console) -> bool:
-    """Write and show the summary; True if the record is complete."""
-    try:
-        summary = summarise(read_record(run_dir))
-        for warning in summary.warnings:
-            console.error(f"deploy.launch: warning: {warning}")
-        paths = [write_summary(run_dir, summary)]
-        console.line(summary_text(summary.values))
-        if _drawing_loaded(stop):
-            paths.append(write_curve(run_dir, summary))
-        else:
-            console.error(f"no time to draw the learning curve; python -m deploy.summary {run_dir} does")
-    except OSError as error:
-        console.error(f"deploy.launch: error: {run_dir}: the summary cannot be written: {error.strerror}")
-        return False
-    for path in paths:
-        console.line(str(_shortened(path)))
-    return True
-
-
-def _load_drawing() -> None:
-    """Import what the learning curve is drawn with while the run is going on: it takes seconds on a fresh clone."""
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
-    import matplotlib.backends.backend_agg  # noqa: F401
-
-
-def _drawing_loaded(stop: StopSignals) -> bool:
-    for thread in threading.enumerate():
-        if thread.name == "load drawing":
-            limit_s = None if stop.asked_s is None else stop.asked_s + _CURVE_UNTIL_S - time.monotonic()
-            thread.join(None if limit_s is None else max(0.0, limit_s))
-            return not thread.is_alive()
-    return True
-
-
-def _write_tables(directory: Path, configurations: Mapping[str, Any]) -> dict[str, Path]:
-    directory.mkdir(parents=True, exist_ok=True)
-    paths = {service: directory / f"{service}.toml" for service in SERVICES}
-    for service, path in paths.items():
-        path.write_text(tomli_w.dumps(to_tables(configurations[service])), encoding="utf-8")
-    return paths
-
-
-def _run_file(options: LaunchOptions, configurations: Mapping[str, Any], link: NetworkLink) -> RunFile:
-    bridge = configurations[ROBOT_BRIDGE]
-    part = link.part()
-    return RunFile(
-        id=bridge.run.id,
-        mode=options.request.placement.mode,
-        task=bridge.task.name,
-        algorithm=configurations[LEARNER].algorithm.name,
-        seed=bridge.run.seed,
-        steps=bridge.robot_bridge.steps,
-        pacing=bridge.robot_bridge.pacing,
-        network=options.network,
-        backend=part.kind if part else NO_NETWORK,
-        placement=dict(options.request.placement.host),
-        conditions=options.conditions.to_table() if options.conditions and part else {},
-        versions=versions(),
-    )
-
-
-def _shortened(path: Path) -> Path:
-    """The path as a user in this folder would type it."""
-    here = Path.cwd()
-    return path.relative_to(here) if path.is_relative_to(here) else path
+def leave(code: int) -> NoReturn:
+    """End this process at once: shutting Python down under a thread that still loads the drawing library crashes."""
+    with contextlib.suppress(OSError):  # nobody may be reading any more
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(code)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

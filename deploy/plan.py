@@ -117,19 +117,19 @@ def split_overrides(overrides: Iterable[str]) -> tuple[list[str], dict[str, Any]
 
 
 def plan_run(
-    request: RunRequest, ports: PortMap, link: NetworkLink, conditions: NetworkConditions | None
+    request: RunRequest, ports: PortMap, network_link: NetworkLink, conditions: NetworkConditions | None
 ) -> dict[str, Any]:
     """Return service -> configuration.
 
     Args:
         request: what was asked for.
         ports: where the services listen.
-        link: the network between the hosts, open.
+        network_link: the network between the hosts, open.
         conditions: of that network; None if nothing crosses it.
     """
     if request.algorithm not in ALGORITHMS:
         raise ConfigError(f"--algorithm {request.algorithm}: expected one of {', '.join(ALGORITHMS)}")
-    tables = {service: _tables(service, request, ports, link, conditions) for service in SERVICES}
+    tables = {service: _tables(service, request, ports, network_link, conditions) for service in SERVICES}
     for override in request.overrides:
         _apply_override(tables, override)
     configurations = {
@@ -149,7 +149,7 @@ def _tables(
     service: str,
     request: RunRequest,
     ports: PortMap,
-    link: NetworkLink,
+    network_link: NetworkLink,
     conditions: NetworkConditions | None,
 ) -> Tables:
     placement = request.placement
@@ -157,7 +157,7 @@ def _tables(
     algorithm = {"name": request.algorithm}
     tables: Tables = {
         "run": _without_none({"id": request.run_id, "directory": str(request.run_dir), "seed": request.seed}),
-        "transport": _transport_table(service, placement, ports, link, conditions),
+        "transport": _transport_table(service, placement, ports, network_link, conditions),
     }
     match service:
         case "robot_bridge":
@@ -182,15 +182,15 @@ def _transport_table(
     service: str,
     placement: Placement,
     ports: PortMap,
-    link: NetworkLink,
+    network_link: NetworkLink,
     conditions: NetworkConditions | None,
 ) -> dict[str, Any]:
     here = placement.host[service]
     table: dict[str, Any] = {"socket_buffer_kib": LIMITED_SOCKET_BUFFER_KIB if _is_limited(conditions) else 0}
     for lane in Lane:
-        table[f"listen_{lane.value}"] = _endpoint(link.listen_address(here), ports.port(service, lane))
+        table[f"listen_{lane.value}"] = _endpoint(network_link.listen_address(here), ports.port(service, lane))
         table[f"connect_{lane.value}"] = [
-            _endpoint(*link.dial_address(here, placement.host[listener], ports.port(listener, lane)))
+            _endpoint(*network_link.dial_address(here, placement.host[listener], ports.port(listener, lane)))
             for dialler, listener in connections()
             if dialler == service
         ]

@@ -7,6 +7,8 @@ import time
 from types import FrameType, TracebackType
 from typing import Any, Self
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
 _NUMBERS = (signal.SIGINT, signal.SIGTERM)
 
 

@@ -92,11 +92,11 @@ class Supervisor:
         the learner last, because the others' last data are for it. Then force.
         """
         bridge = self.children.get(ROBOT_BRIDGE)
-        rest_s = begun_s + self._stop_times.rest_after_s
+        rest_s = begun_s  # unless the bridge tells them
         if bridge is not None and bridge.alive:
+            if self._run_has_begun():
+                rest_s += self._stop_times.rest_after_s
             bridge.signal(signal.SIGINT)
-        else:
-            rest_s = begun_s  # nobody will tell them
         self._wait_until(rest_s)
         for child in sorted(self.children.values(), key=lambda child: child.name == LEARNER):
             if child.name != ROBOT_BRIDGE:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sys
+from threadpoolctl import threadpool_limits
 
 from common import topics
 from common.algorithms.presets import resolve_config
 from common.policies import initial_policy
-from common.service import Service, run_service
+from common.service import Service, end_process, run_service
 from services.actor.actor import Actor
 from services.actor.config import ActorConfig
 
@@ -17,9 +17,10 @@ def serve(service: Service, config: ActorConfig) -> None:
     spec = service.query_spec()
     if spec is None:
         return
+    # Two threads that wait for each other on a contended core are a hundred times slower than one.
+    threadpool_limits(config.actor.threads)
     if spec.has_camera:
-        # Only the policies of camera tasks compute with torch, and torch's threads are set before its first use.
-        import torch
+        import torch  # only the policies of camera tasks compute with it
 
         torch.set_num_threads(config.actor.threads)
     name = config.algorithm.name
@@ -31,4 +32,4 @@ def serve(service: Service, config: ActorConfig) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run_service(topics.ACTOR, ActorConfig, serve, description=__doc__))
+    end_process(run_service(topics.ACTOR, ActorConfig, serve, description=__doc__))

@@ -43,6 +43,7 @@ class ExperienceForwarder:
         )
         self._incoming: deque[TimeStep] = deque()
         self._answers: OrderedDict[tuple[int, int], PolicyExtras] = OrderedDict()
+        self._in_hand = 0  # taken from the receiver and not yet with the sender
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="experience", daemon=True)
         self.experiences = 0
@@ -79,7 +80,7 @@ class ExperienceForwarder:
     def is_drained(self, incarnation: int, produced: int) -> bool:
         """True if all that the bridge produced has come, gone on to replay, and been acknowledged there."""
         with self._wake:
-            complete = self._receiver.has_all(incarnation, produced) and not self._incoming
+            complete = self._receiver.has_all(incarnation, produced) and not (self._incoming or self._in_hand)
         return complete and self._sender.unacknowledged == 0
 
     def counters(self) -> dict[str, float]:
@@ -108,9 +109,11 @@ class ExperienceForwarder:
                 for head, _ in self._heads.take():
                     self._receiver.note_head(head)
                 ready = [self._experience(time_step) for time_step in self._receiver.take_ready()]
+                self._in_hand = len(ready)
                 acknowledgement = self._receiver.acknowledgement()
             for experience in ready:
                 self._sender.put(experience.seq, encode(experience))
+            self._in_hand = 0
             if acknowledgement and clock.now_ns() >= next_ack_ns:
                 next_ack_ns = clock.now_ns() + round(ACKNOWLEDGE_S * 1e9)
                 self._ack_publisher.put(encode(acknowledgement))

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 from pathlib import Path
 
 from common import topics
-from common.service import Service, run_service
+from common.service import Service, end_process, run_service
 from services.learner.config import LearnerConfig
 
 logger = logging.getLogger(__name__)
@@ -48,4 +47,4 @@ def serve(service: Service, config: LearnerConfig) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run_service(topics.LEARNER, LearnerConfig, serve, description=__doc__))
+    end_process(run_service(topics.LEARNER, LearnerConfig, serve, description=__doc__))

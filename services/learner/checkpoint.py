@@ -7,6 +7,7 @@ import logging
 import os
 import threading
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -69,11 +70,11 @@ def restore(directory: Path, algorithm: Algorithm) -> int:
     if not path.exists():
         return 0
     try:
-        with np.load(path, allow_pickle=False) as file:
-            state = dict(file)
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            state = dict(arrays)
         version = int(state.pop(_VERSION_KEY))
         algorithm.load_state_dict(state)
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile) as error:
         raise ConfigError(f"{path}: cannot go on from this checkpoint: {error}; remove it to begin anew") from error
     logger.info("going on from update %d, policy version %d", algorithm.updates, version)
     return version

@@ -10,6 +10,7 @@ from common import topics
 from common.algorithms.base import Algorithm
 from common.algorithms.presets import SACConfig
 from common.codec import encode
+from common.errors import TransportError
 from common.messages import PolicyWeights
 from common.minibatch import Minibatch
 from common.service import Service
@@ -62,7 +63,10 @@ class PolicyPusher:
                 if self._stopping or self._pending is None:
                     return
                 weights, self._pending = self._pending, None
-            self._publisher.put(encode(weights))
+            try:
+                self._publisher.put(encode(weights))
+            except TransportError:
+                return  # The session was closed around a push that was stuck in a dead link.
             self.pushes += 1
 
 

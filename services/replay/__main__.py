@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-
 from common import topics
 from common.algorithms.presets import resolve_config
-from common.service import Service, run_service
+from common.service import Service, end_process, run_service
 from services.replay.config import ReplayConfig
 from services.replay.replay import Replay
 
@@ -25,4 +23,4 @@ def serve(service: Service, config: ReplayConfig) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run_service(topics.REPLAY, ReplayConfig, serve, description=__doc__))
+    end_process(run_service(topics.REPLAY, ReplayConfig, serve, description=__doc__))

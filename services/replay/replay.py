@@ -33,6 +33,8 @@ ACKNOWLEDGE_S = 0.1
 """Period of the acknowledgement to the actor."""
 LOST_AFTER_NS = 1_000_000_000
 """A minibatch that the learner still misses after this long is taken for lost on the way."""
+ACTOR_LOST_AFTER_S = 5.0
+"""At the end, what an actor still owes is waited for this long: it may be behind a network outage."""
 
 
 class Replay:
@@ -189,6 +191,6 @@ class Replay:
             return True
         if self._persisted.get(finished.incarnation, 0) >= finished.produced:
             return True
-        # Something is missing that will not come: the actor has nothing more, or is gone.
-        actor = self._service.peer_state(topics.ACTOR)
-        return actor in ("drained", "stopped", "gone") and self._receiver.received_all
+        # Something is missing that will not come: the actor has nothing more, or is gone for good.
+        drained = self._service.peer_state(topics.ACTOR) == "drained" and self._receiver.received_all
+        return drained or self._service.peer_age_s(topics.ACTOR) > ACTOR_LOST_AFTER_S

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-import sys
 from pathlib import Path
 
 import numpy as np
 
 from common import topics
 from common.record import read_parts
-from common.service import Service, run_service
+from common.service import Service, end_process, run_service
 from services.robot_bridge.bookkeeping import Totals
 from services.robot_bridge.bridge import RobotBridge
 from services.robot_bridge.config import RobotBridgeConfig
@@ -49,4 +48,4 @@ def _earlier_totals(directory: Path) -> Totals:
 
 
 if __name__ == "__main__":
-    sys.exit(run_service(topics.ROBOT_BRIDGE, RobotBridgeConfig, serve, description=__doc__))
+    end_process(run_service(topics.ROBOT_BRIDGE, RobotBridgeConfig, serve, description=__doc__))

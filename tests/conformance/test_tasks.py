@@ -12,13 +12,9 @@ from common.networks.sizes import cropped_shape, map_size
 from services.robot_bridge.robots.dot import MAX_SPEED, Dot
 from services.robot_bridge.tasks import TASKS, load_task
 from services.robot_bridge.tasks.noise_frames import read_frame_id
-from services.robot_bridge.tasks.visual_dot_reacher import BACKGROUND_RGB, DOT_RADIUS, TARGET_RGB
+from services.robot_bridge.tasks.visual_dot_reacher import BACKGROUND_RGB, DOT_RADIUS, DOT_RGB, TARGET_RGB
 
-PRESETS = [
-    (name, preset)
-    for name in sorted(TASKS)
-    for preset in load_task(name, rng=np.random.default_rng(0)).PRESETS  # fmt: skip
-]
+PRESETS = [(name, preset) for name in sorted(TASKS) for preset in load_task(name, rng=np.random.default_rng(0)).PRESETS]
 
 
 @pytest.fixture(params=sorted(TASKS))
@@ -52,8 +48,10 @@ def drive(task, actions, start_ns=0):
 
 def random_actions(task, count=40, seed=1):
     spec = task.spec
-    return np.random.default_rng(seed).uniform(spec.action_low, spec.action_high, (count, len(spec.action_low))).astype(
-        np.float32
+    return (
+        np.random.default_rng(seed)
+        .uniform(spec.action_low, spec.action_high, (count, len(spec.action_low)))
+        .astype(np.float32)
     )
 
 
@@ -243,7 +241,7 @@ def test_a_row_in_the_configuration_adds_a_task():
     assert load_task("mine", rows=rows, rng=np.random.default_rng(0)).spec.task == "mine"
 
 
-@pytest.mark.parametrize("target", ["nowhere:Task", "services.robot_bridge.tasks.base:Nobody", "no colon", "os:path", 3])
+@pytest.mark.parametrize("target", ["nowhere:Task", "services.robot_bridge.tasks:Nobody", "no colon", "os:path", 3])
 def test_a_row_that_leads_to_no_task_is_named(target):
     with pytest.raises(ConfigError, match=r"\[tasks\] mine = .*: expected"):
         load_task("mine", rows={"mine": target}, rng=np.random.default_rng(0))
@@ -350,14 +348,15 @@ def test_a_new_attempt_moves_the_dot_and_keeps_the_goal():
     task = build("visual_dot_reacher")
     task.advance_to(0)
     task.begin_episode()
-    pictures = []
+    frames = []
     for _ in range(4):
         task.begin_attempt()
-        frame = task.read().frames[0]
-        pictures.append((frame == TARGET_RGB).all(axis=-1))
-        assert (frame == frame[0, 0]).all(axis=-1).any()
-    # A dot may cover the target; apart from it, the target is where it was.
-    assert np.logical_or.reduce(pictures).sum() <= max(p.sum() for p in pictures) + 40
+        frames.append(task.read().frames[0])
+    assert len({frame.tobytes() for frame in frames}) == 4
+    targets = [(frame == TARGET_RGB).all(axis=-1) for frame in frames]
+    dots = [~target & (frame != BACKGROUND_RGB).any(axis=-1) for target, frame in zip(targets, frames, strict=True)]
+    for target, dot in zip(targets, dots, strict=True):
+        assert (target == targets[0])[~dot & ~dots[0]].all()
 
 
 # ---------------------------------------------------------------------- what the camera shows
@@ -368,32 +367,31 @@ def picture_of(task, position):
     return task.read().frames[0]
 
 
-def dot_pixels(task, position):
-    """Pixels that the dot covers, whole or in part: where the picture is not that of a dot far away."""
-    far = [-np.sign(position[0] or 1.0), -np.sign(position[1] or 1.0)]
-    return (picture_of(task, position) != picture_of(task, far)).any(axis=-1) & near(position)
-
-
-def near(position):
-    """Pixels on the position's side of the picture; x runs along the columns."""
-    rows, columns = np.mgrid[:44, :44] - 21.5
-    return (columns * (position[0] or 1.0) >= 0) & (rows * (position[1] or 1.0) >= 0)
+def dot_pixels(frame):
+    """Pixels of which the dot covers more than half: nothing else in the picture is blue."""
+    return frame[..., 2] > (BACKGROUND_RGB[2] + DOT_RGB[2]) / 2
 
 
 @pytest.mark.parametrize("preset", ["demo", "thesis"])
 def test_the_dot_is_wholly_in_view_after_the_central_crop_wherever_it_is(preset):
     task = build("visual_dot_reacher", preset)
     (y, x), (h, w) = central_crop_offset(task.spec), crop_shape(task.spec)
-    inside = np.zeros((44, 44), bool)
-    inside[y : y + h, x : x + w] = True
-    for px in np.linspace(-1, 1, 9):
-        for py in np.linspace(-1, 1, 9):
-            if max(abs(px), abs(py)) < 0.6:  # nearer the middle the two dots could overlap
-                continue
-            covered = dot_pixels(task, [px, py])
-            assert not (covered & ~inside).any(), (px, py)
-            if min(abs(px), abs(py)) > 0.3:  # all of it on its own side of the picture
-                assert covered.sum() >= np.pi * DOT_RADIUS**2, (px, py)
+    areas = []
+    for px in np.linspace(-1, 1, 21):
+        for py in np.linspace(-1, 1, 21):
+            covered = dot_pixels(picture_of(task, [px, py]))
+            areas.append(covered.sum())
+            assert covered[y : y + h, x : x + w].sum() == covered.sum(), (px, py)
+    assert min(areas) >= 28  # pi 3**2, and OpenCV draws half a pixel more
+    assert max(areas) <= np.pi * (DOT_RADIUS + 1) ** 2
+
+
+def test_the_dot_is_drawn_where_it_is():
+    task = build("visual_dot_reacher")
+    for position in ([0.0, 0.0], [-1.0, -1.0], [1.0, 0.5], [0.2, -0.7]):
+        rows, columns = np.nonzero(dot_pixels(picture_of(task, position)))
+        # x to the right, y down; the centre moves over 35 pixels.
+        np.testing.assert_allclose([columns.mean(), rows.mean()], 21.5 + np.array(position) * 17.5, atol=0.6)
 
 
 def test_different_positions_look_different():
@@ -427,14 +425,13 @@ def test_noise_frames_carry_their_id_and_cannot_be_compressed():
         (frame,) = task.read().frames
         assert read_frame_id(frame) == expected
         assert len(zlib.compress(frame.tobytes())) > 0.98 * frame.nbytes
-    assert read_frame_id(frame[:, :, ::1]) == 2
 
 
-@pytest.mark.parametrize(("rate", "counts"), [(1.2, [1, 1, 1, 1, 2]), (0.5, [1, 0, 1, 0, 1]), (3.0, [1, 3, 3, 3, 3])])
-def test_a_camera_brings_its_own_number_of_frames(rate, counts):
+@pytest.mark.parametrize("rate", [0.0, 0.5, 1.2, 3.0])
+def test_a_camera_brings_its_own_number_of_frames(rate):
     task = build("noise_frames", frames_per_cycle=rate)
     readings, _ = drive(task, random_actions(task, 99))
     brought = [len(reading.frame_ids) for reading in readings]
-    assert sum(brought) == pytest.approx(100 * rate, abs=max(rate, 1.0) + 1)
-    assert len(set(brought[1:])) <= 2
-    assert brought[0] == counts[0]
+    assert brought[0] == 1
+    assert sum(brought[1:]) == pytest.approx(99 * rate, abs=1)
+    assert set(brought[1:]) <= {int(rate), int(rate) + 1}

@@ -7,7 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-from deploy import launch
+from deploy import launch, run
 
 behaviours = json.loads(sys.argv[1])
 FAKE = str(Path(__file__).with_name("fake_service.py"))
@@ -18,5 +18,5 @@ def fake_command(service: str, config_path: Path) -> list[str]:
     return [sys.executable, "-S", "-E", FAKE, service, str(run_dir), behaviours.get(service, "wait")]
 
 
-launch.service_command = fake_command
-sys.exit(launch.main(sys.argv[2:]))
+run.service_command = fake_command
+launch.leave(launch.main(sys.argv[2:]))

@@ -13,8 +13,11 @@ from pathlib import Path
 import pytest
 
 from common.config import load_config
-from deploy import launch
+from deploy import launch, run
+from deploy.console import Console
+from deploy.options import parse_options
 from deploy.plan import CONFIG_CLASSES
+from deploy.stop_signals import INTERRUPTED, StopSignals
 
 REPOSITORY = Path(__file__).parents[2]
 PATIENCE_S = 60.0
@@ -185,3 +188,11 @@ def test_a_run_directory_that_cannot_be_made_is_named(tmp_path: Path, capsys: py
     (tmp_path / "file").touch()
     assert launch.main(["local_only", "--task", "dot_reacher", "--run-dir", str(tmp_path / "file" / "run")]) == 1
     assert str(tmp_path / "file" / "run") in capsys.readouterr().err
+
+
+def test_ctrl_c_before_anything_is_started_leaves_nothing(tmp_path: Path) -> None:
+    options = parse_options(["local_only", "--task", "dot_reacher", "--run-dir", str(tmp_path / "run")])
+    stop = StopSignals()
+    stop.asked_s = time.monotonic()
+    assert run.launch(options, stop, Console()) == INTERRUPTED
+    assert not (tmp_path / "run").exists()

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.integration.ring_processes import SMALL_AND_FAST, RingProcesses, options, start_all
 
 from common.frame_ring import RING_FILE, RingReader
 from services.robot_bridge.tasks.noise_frames import read_frame_id
+from tests.integration.ring_processes import SMALL_AND_FAST, RingProcesses, options, start_all
 
 ORDERS = (
     ("robot_bridge", "actor", "replay", "learner"),

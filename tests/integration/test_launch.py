@@ -113,7 +113,8 @@ def test_a_dead_service_is_reported_at_once_and_the_exit_code_tells(tmp_path: Pa
         os.kill(part["pid"], signal.SIGKILL)
         output, _ = process.communicate(timeout=120)
     assert process.returncode == 1, output
-    assert "learner" in output and "SIGKILL" in output
+    assert "learner" in output
+    assert "SIGKILL" in output
     assert "python -m services.learner --config" in output.replace(sys.executable, "python")
     summary = json.loads((run_dir / "summary.json").read_text())
     assert summary["experience"]["lost"] == 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import itertools
 import threading
-import time
 from collections import defaultdict
 
 from common import topics
@@ -15,11 +14,10 @@ from common.messages import Command, CommandReply
 from common.run_settings import RunSettings
 from common.service import Service
 from common.transport import InMemoryNetwork
+from tests.helpers import TIMEOUT_S
 
 START_NS = 1_000_000_000
 """What a fresh :class:`FakeClock` shows."""
-TIMEOUT_S = 20.0
-"""How long a test waits for another thread before it fails; never how long it takes."""
 
 
 class EventClock(FakeClock):
@@ -192,11 +190,3 @@ class Peer:
         reply = self.transport.query(topics.command_topic(service), encode(Command(name)))
         assert reply is not None
         return decode(reply, CommandReply)
-
-
-def eventually(holds) -> None:
-    """Wait until ``holds()``, which another thread brings about; fail if it never does."""
-    deadline = time.monotonic() + TIMEOUT_S
-    while not holds():
-        assert time.monotonic() < deadline, "it never came about"
-        time.sleep(0.001)

@@ -1,0 +1,106 @@
+"""A checkpoint that cannot be used is an error that names it; a disk that cannot be written is not."""
+
+import io
+
+import numpy as np
+import pytest
+
+from common.algorithms.presets import SACConfig
+from common.algorithms.sac import SAC
+from common.errors import ConfigError
+from services.learner.checkpoint import CHECKPOINT_FILE, POLICY_FILE, CheckpointWriter, restore
+from tests.helpers import make_spec
+
+SPEC = make_spec(camera=False)
+
+
+def make_algorithm(hidden_size=16):
+    return SAC(SPEC, SACConfig(hidden_size=hidden_size, batch_size=8), seed=0, precision="float32")
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    """The file of a good checkpoint, policy version 6."""
+    algorithm = make_algorithm()
+    writer = CheckpointWriter(tmp_path)
+    writer.write(algorithm.policy_weights(6, "float32"), algorithm.state_dict())
+    writer.close()
+    assert restore(tmp_path, make_algorithm()) == 6
+    return tmp_path / CHECKPOINT_FILE
+
+
+def unchanged(algorithm, act):
+    before = algorithm.state_dict()
+    act()
+    return all(np.array_equal(value, before[name]) for name, value in algorithm.state_dict().items())
+
+
+def one_array():
+    buffer = io.BytesIO()
+    np.save(buffer, np.zeros(3))
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: b"",
+        lambda content: content[:10],
+        lambda content: content[: len(content) // 2],
+        lambda content: content[:-1],
+        lambda content: b"not a checkpoint at all",
+        lambda content: content[:3000] + bytes(64) + content[3064:],
+        lambda content: b"\x93NUMPY" + content[6:],
+        lambda content: one_array(),
+    ],
+    ids=["empty", "ten bytes", "half", "one byte short", "text", "overwritten", "another format", "one array"],
+)
+def test_a_damaged_checkpoint_is_named_and_changes_nothing(checkpoint, damage):
+    checkpoint.write_bytes(damage(checkpoint.read_bytes()))
+    algorithm = make_algorithm()
+
+    def attempt():
+        with pytest.raises(ConfigError, match=rf"{CHECKPOINT_FILE}: cannot go on from this checkpoint: .*remove it"):
+            restore(checkpoint.parent, algorithm)
+
+    assert unchanged(algorithm, attempt)
+
+
+def test_a_checkpoint_of_other_networks_is_named_with_the_first_that_differs(checkpoint):
+    with pytest.raises(ConfigError, match=r"cannot go on from this checkpoint: .*expected \[32.*got \[16"):
+        restore(checkpoint.parent, make_algorithm(hidden_size=32))
+
+
+@pytest.mark.parametrize("missing", ["policy_version", "updates", "log_temperature"])
+def test_a_checkpoint_that_lacks_something_is_named(checkpoint, missing):
+    with np.load(checkpoint) as file:
+        state = {name: value for name, value in file.items() if name != missing}
+    np.savez(checkpoint, **state)
+    with pytest.raises(ConfigError, match=f"{CHECKPOINT_FILE}.*{missing}"):
+        restore(checkpoint.parent, make_algorithm())
+
+
+def test_a_checkpoint_is_never_unpickled(checkpoint):
+    evil = np.array([{"a": 1}], dtype=object)
+    np.savez(checkpoint, policy_version=np.int64(1), evil=evil)
+    with pytest.raises(ConfigError, match="allow_pickle"):
+        restore(checkpoint.parent, make_algorithm())
+
+
+def test_the_last_of_several_checkpoints_is_what_remains(tmp_path):
+    algorithm = make_algorithm()
+    writer = CheckpointWriter(tmp_path)
+    for version in range(1, 6):
+        writer.write(algorithm.policy_weights(version, "float32"), algorithm.state_dict())
+    writer.close()
+    assert restore(tmp_path, make_algorithm()) == 5
+
+
+def test_a_disk_that_cannot_be_written_is_logged_and_does_not_end_the_learner(tmp_path, caplog):
+    algorithm = make_algorithm()
+    gone = tmp_path / "gone"
+    writer = CheckpointWriter(gone)
+    writer.write(algorithm.policy_weights(1, "float32"), algorithm.state_dict())
+    writer.close()
+    assert "the checkpoint cannot be written" in caplog.text
+    assert not (gone / POLICY_FILE).exists()
