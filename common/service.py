@@ -6,6 +6,7 @@ import argparse
 import gc
 import logging
 import logging.handlers
+import math
 import os
 import queue
 import signal
@@ -271,7 +272,8 @@ class Service:
         self._peers[status.service] = Peer(status, at_ns)
 
     def _send_status(self) -> None:
-        counters = {name: float(value) for name, value in self.counters().items()}
+        # A loss that is no number any more must not make the whole service look gone.
+        counters = {name: float(value) for name, value in self.counters().items() if math.isfinite(value)}
         status = Status(self.name, self.run.id, self.incarnation, self.state, counters)
         self._status_publisher.put(encode(status))
 
@@ -319,13 +321,18 @@ def run_service(
     )
     options = parser.parse_args(arguments)
     try:
-        config = load_config(config_class, options.config, options.set)
-        return _run(name, config, serve)
+        config: Any = load_config(config_class, options.config, options.set)
+        listener = _start_logging(Path(config.run.directory), name)
     except RelodError as error:
         print(f"{name}: error: {error}", file=sys.stderr)
+        return 1
+    try:
+        return _run(name, config, serve)
+    except RelodError as error:
         logger.error("%s", error)
         return 1
     finally:
+        listener.stop()
         logging.shutdown()
 
 
@@ -337,34 +344,38 @@ def end_process(exit_code: int) -> NoReturn:
 
 
 def _run(name: str, config: Any, serve: Callable[[Service, Any], None]) -> int:
-    listener = _start_logging(Path(config.run.directory), name)
     # The interpreter's default of 5 ms is how long a computing thread may keep a waiting real-time thread out.
     sys.setswitchinterval(5e-4)
+    service = Service(name, config.run, ZenohTransport(config.run, config.transport))
+    _stop_on_signals(service)
+    logger.info("%s starts: run %s, process %d", name, config.run.id, os.getpid())
     try:
-        service = Service(name, config.run, ZenohTransport(config.run, config.transport))
-        # A service started in the background by a script inherits ignored signals: install handlers explicitly.
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda number, _: service.stop(signal.Signals(number).name))
-        logger.info("%s starts: run %s, process %d", name, config.run.id, os.getpid())
-        try:
-            service.start()
-            gc.freeze()
-            serve(service, config)
-        except RelodError as error:
-            service.failure = str(error)
-            raise
-        except Exception as error:
-            service.failure = f"{type(error).__name__}: {error}"
-            logger.exception("unexpected error")
-            raise ServiceError(f"unexpected {type(error).__name__}: {error}; see the log") from error
-        finally:
-            service.close()
-            logger.info("%s has ended", name)
-        if service.failure:
-            raise ServiceError(service.failure)
-        return 0
+        service.start()
+        gc.freeze()
+        serve(service, config)
+    except RelodError as error:
+        service.failure = str(error)
+        raise
+    except Exception as error:
+        service.failure = f"{type(error).__name__}: {error}"
+        logger.exception("unexpected error")
+        raise ServiceError(f"unexpected {type(error).__name__}: {error}; see the log") from error
     finally:
-        listener.stop()
+        service.close()
+        logger.info("%s has ended", name)
+    if service.failure:
+        raise ServiceError(service.failure)
+    return 0
+
+
+def _stop_on_signals(service: Service) -> None:
+    # A handler interrupts the main thread, which may hold the very lock that stopping takes: a thread can wait for it.
+    def handle(number: int, _: object) -> None:
+        threading.Thread(target=service.stop, args=(signal.Signals(number).name,), daemon=True).start()
+
+    # A service started in the background by a script inherits ignored signals: install handlers explicitly.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handle)
 
 
 def _start_logging(directory: Path, name: str) -> logging.handlers.QueueListener:

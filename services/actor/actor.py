@@ -89,8 +89,8 @@ class Actor:
         return {"actions": self._actions, "policy_version": self._swap.policy.version, **self._forwarder.counters()}
 
     def _add_frames(self, time_step: TimeStep) -> Stack[UInt8Array] | None:
-        if self._stack is None:
-            return None
+        if self._stack is None or time_step.incarnation < self._newest[0]:
+            return None  # A bridge's last words must not displace the frames of its successor.
         try:
             return self._stack.add(time_step, time_step.frame_ids.tolist(), list(time_step.frames))
         except MessageError as error:

@@ -117,10 +117,10 @@ class Learner:
                     self._checkpoint_asked.clear()
                     next_checkpoint_ns = now_ns + self._checkpoint_ns
                     self._save()
-            self._source.stop()
             self._save()
             service.drain(lambda: True, lambda: None)
         finally:
+            self._source.stop()
             self._pusher.close()
             self._checkpoints.close()
 

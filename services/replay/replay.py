@@ -59,6 +59,8 @@ class Replay:
         self._heads = self._inbox(topics.EXPERIENCE_HEAD, StreamHead)
         self._credits = self._inbox(topics.CREDIT, Credit)
         self._ack_publisher = service.transport.publisher(topics.EXPERIENCE_ACK)
+        # In lockstep the actor goes by what is owed: it must not hear of it a hundred steps later.
+        self._ack_period_ns = 0 if spec.pacing == "lockstep" else round(ACKNOWLEDGE_S * 1e9)
         self._next_ack_ns = 0
         self._maps = settings.access == "map"
         self._minibatches = service.transport.publisher(topics.ROW_MINIBATCH if self._maps else topics.ARRAY_MINIBATCH)
@@ -84,7 +86,7 @@ class Replay:
                     if not self._has_work():
                         service.wake.wait(ACKNOWLEDGE_S)
                 self.step()
-            service.drain(self._is_drained, self._store)
+            service.drain(self._is_drained, self._keep)
         finally:
             self._ring.close()
 
@@ -92,6 +94,7 @@ class Replay:
         """Handle all that has come."""
         self._store()
         self._serve_credit()
+        self._acknowledge()
 
     def counters(self) -> dict[str, float]:
         """Counts for the heartbeat and the record."""
@@ -120,6 +123,10 @@ class Replay:
 
     # ------------------------------------------------------------------ experience
 
+    def _keep(self) -> None:
+        self._store()
+        self._acknowledge()
+
     def _store(self) -> None:
         for inbox in self._experiences:
             for experience, _ in inbox.take():
@@ -128,9 +135,11 @@ class Replay:
             self._receiver.note_head(head)
         for experience in self._receiver.take_ready():
             self._append(experience)
+
+    def _acknowledge(self) -> None:
         now_ns = self._service.clock.now_ns()
         if now_ns >= self._next_ack_ns and (ack := self._receiver.acknowledgement(self._budget.owed)):
-            self._next_ack_ns = now_ns + round(ACKNOWLEDGE_S * 1e9)
+            self._next_ack_ns = now_ns + self._ack_period_ns
             self._ack_publisher.put(encode(ack))
 
     def _append(self, experience: Experience) -> None:

@@ -125,7 +125,8 @@ def test_a_run_without_parts_has_none(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b'{"incarnation": 3', b"\0" * 100, b"\xff\xfe", b"[]", b"3", b"null", b"{}", b'{"incarnation": "x"}']
+    "content",
+    [b"", b'{"incarnation": 3', b"\0" * 100, b"\xff\xfe", b"[]", b"3", b"null", b"{}", b'{"incarnation": "x"}'],
 )
 def test_a_part_that_cannot_be_read_is_left_out_and_told(tmp_path, caplog, content):
     write_atomically(tmp_path / "parts" / "actor-1.json", '{"incarnation": 1}')

@@ -123,6 +123,15 @@ def test_a_new_bridge_is_answered_though_its_numbers_are_lower(tmp_path):
     assert scene.take(10) == []  # from the bridge before
 
 
+def test_a_late_word_of_the_bridge_before_does_not_disturb_the_stack(tmp_path):
+    scene = Scene(tmp_path)
+    scene.take(0, 1)
+    scene.take(*(scene.time_step(seq, incarnation=BRIDGE + 1) for seq in range(4)))
+    scene.take(9)
+    scene.take(scene.time_step(4, incarnation=BRIDGE + 1))
+    assert stack_ids(scene.policy.observations[-1]) == [1, 2, 3, 4]
+
+
 def test_of_two_bridges_in_one_burst_the_newer_is_answered(tmp_path):
     scene = Scene(tmp_path)
     (action,) = scene.take(scene.time_step(0, incarnation=BRIDGE + 1), scene.time_step(9))

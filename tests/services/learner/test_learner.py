@@ -141,6 +141,14 @@ def test_the_run_ends_with_the_bridges_word(tmp_path):
     assert scene.service.state == "drained"
 
 
+def test_a_learner_that_fails_asks_for_nothing_more(tmp_path):
+    scene = Scene(tmp_path, 5)
+    scene.algorithm.update = lambda minibatch: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        scene.run()
+    assert scene.source.stopped
+
+
 def test_losses_are_told_once_a_second(tmp_path):
     scene = Scene(tmp_path, 3, lambda given: scene.clock.advance(0.6))
     scene.run()

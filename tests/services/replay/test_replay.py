@@ -28,11 +28,12 @@ CONFIG = SACConfig(batch_size=4, min_size_to_sample=10, replay_capacity=200)
 class Scene:
     """Replay, not running, between an actor and a learner that the test plays."""
 
-    def __init__(self, directory, network=None, config=CONFIG, **settings) -> None:
+    def __init__(self, directory, config=CONFIG, pacing="realtime", **settings) -> None:
         self.clock = FakeClock()
-        self.network = network or InMemoryNetwork()
+        self.network = InMemoryNetwork()
         self.service = SoloService(topics.REPLAY, self.network, directory, self.clock)
-        self.replay = Replay(self.service, task_spec(), config, ReplaySettings(**settings))
+        spec = replace(task_spec(), pacing=pacing)
+        self.replay = Replay(self.service, spec, config, ReplaySettings(**settings))
         self.peer = Peer(self.network)
         self.acks = self.peer.messages(topics.EXPERIENCE_ACK)
         self.rows = self.peer.messages(topics.ROW_MINIBATCH)
@@ -240,6 +241,15 @@ def test_what_is_owed_is_told_to_the_actor(scene):
     assert scene.ack().updates_owed == 21.0
     scene.ask(4)
     assert scene.ack().updates_owed == 17.0
+
+
+def test_in_lockstep_what_is_owed_is_told_at_once(tmp_path):
+    scene = Scene(tmp_path, pacing="lockstep")
+    bridge = Bridge()
+    scene.send(*attempt(bridge, 13))
+    scene.send(bridge.step())
+    scene.ask(3)  # spent, and told before anything else happens
+    assert [ack.updates_owed for ack in scene.acks] == [3.0, 4.0, 1.0]
 
 
 def test_a_learner_that_comes_late_does_not_catch_up_beyond_the_surplus(tmp_path):
