@@ -39,6 +39,26 @@ class Totals:
     """Attempts begun."""
 
 
+@dataclass
+class CycleCounts:
+    """How the action cycles of one incarnation went."""
+
+    cycles: int = 0
+    overruns: int = 0
+    """Cycles that ended too late for the bridge's own reasons."""
+    overruns_after_1000: int = 0
+    skipped_cycles: int = 0
+    """Whole cycles that passed unnoticed."""
+    late_actions: int = 0
+    """Actions that arrived after the end of the cycle they answer."""
+    unanswered: int = 0
+    """Cycles that ended without an action of their own."""
+    refused_actions: int = 0
+    """Actions that were not applied."""
+    produced: int = 0
+    """TimeSteps published."""
+
+
 class Ledger:
     """Counts action cycles into attempts and episodes.
 

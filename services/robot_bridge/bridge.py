@@ -13,7 +13,7 @@ answer, and the world's time moves by one cycle per step.
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -21,14 +21,14 @@ import numpy as np
 from common import topics
 from common.clock import CycleKeeper
 from common.codec import encode
-from common.errors import ServiceError
-from common.inbox import Arrived, Inbox
-from common.journal import JournalSender
-from common.messages import Action, ActionSource, Finished, Float32Array, TimeStep
+from common.inbox import Arrived
+from common.messages import Action, ActionSource, Finished, Float32Array
 from common.service import Service
-from services.robot_bridge.bookkeeping import EpisodeResult, Ledger, Totals
+from services.robot_bridge.answers import Answers
+from services.robot_bridge.bookkeeping import CycleCounts, EpisodeResult, Ledger, Totals
 from services.robot_bridge.config import RobotBridgeSettings
 from services.robot_bridge.tasks.base import Task
+from services.robot_bridge.time_steps import CommandInForce, TimeStepStream
 from services.robot_bridge.watchdog import Watchdog
 
 logger = logging.getLogger(__name__)
@@ -37,45 +37,10 @@ WARM_UP_CYCLES = 1000
 """``overruns_after_1000`` counts from here."""
 REPUBLISH_NS = 1_000_000_000
 """In lockstep, a TimeStep is published again after this long without an answer."""
-REMEMBERED_STEPS = 256
-"""An action that answers an older TimeStep than this is not even counted as late."""
 WAITING_TOLD_NS = 10_000_000_000
 """How often the log says what the robot waits for."""
 PEERS = (topics.ACTOR, topics.REPLAY)
 """Without these no attempt starts: nobody would act, or nothing would be kept."""
-
-
-@dataclass(frozen=True)
-class CommandInForce:
-    """The robot's command and where it came from."""
-
-    action: Float32Array
-    source: ActionSource
-    answered_seq: int
-    applied_ns: int
-
-
-@dataclass
-class PublishedStep:
-    """When a TimeStep was published, when the cycle that it began ended, and whether an answer has come."""
-
-    published_ns: int
-    end_ns: int | None = None
-    answered: bool = False
-
-
-@dataclass
-class CycleCounts:
-    """Counts of this incarnation."""
-
-    cycles: int = 0
-    overruns: int = 0
-    overruns_after_1000: int = 0
-    skipped_cycles: int = 0
-    late_actions: int = 0
-    unanswered: int = 0
-    refused_actions: int = 0
-    produced: int = 0
 
 
 class RobotBridge:
@@ -89,37 +54,16 @@ class RobotBridge:
         self._keeper = CycleKeeper(self._cycle_ns)
         self._watchdog = Watchdog(round(settings.stop_after * 1e9))
         self._ledger = Ledger(self._spec, totals)
-        self._journal = JournalSender(
-            service.transport,
-            service.incarnation,
-            settings,
-            topic=topics.TIME_STEP,
-            resent=topics.TIME_STEP_RESENT,
-            head=topics.TIME_STEP_HEAD,
-            acknowledgement=topics.TIME_STEP_ACK,
-            clock=self._clock,
-        )
-        self._actions = Inbox(
-            service.transport,
-            topics.ACTION,
-            Action,
-            service.wake,
-            self._clock,
-            service.refusals,
-            dimensions=self._spec.dimensions,
-            capacity=16,
-        )
-        self._finished_publisher = service.transport.publisher(topics.FINISHED)
         self.counts = CycleCounts()
+        self._time_steps = TimeStepStream(service, settings, self.counts)
+        self._answers = Answers(service, self._spec, self.counts)
+        self._finished_publisher = service.transport.publisher(topics.FINISHED)
         self._last_return: float | None = None
         self._engaged = False
         self._needs_new_goal = True
-        self._actor_incarnation = 0
         self._attempt_first_seq = 0
-        self._published: dict[int, PublishedStep] = {}
         self._in_force = self._no_command()
         self._world_ns = self._clock.now_ns()
-        self._payload = b""
         self._told_ns = self._clock.now_ns()
         service.counters = self.counters
         service.details = self.details
@@ -130,13 +74,13 @@ class RobotBridge:
 
     def run(self) -> None:
         """Act until the run's steps are done or the service is asked to stop; then hand over what is on its way."""
-        self._journal.start()
+        self._time_steps.journal.start()
         self._service.state = "running"
         try:
             self._run_attempts()
             self._finish("stopped" if self._service.stopping.is_set() else "steps")
         finally:
-            self._journal.stop()
+            self._time_steps.journal.stop()
 
     # ------------------------------------------------------------------ attempts
 
@@ -176,7 +120,7 @@ class RobotBridge:
     def _end_cycle(self) -> tuple[bool, bool]:
         """Judge the cycle that ends now and publish what it led to; return whether the attempt has ended, and how."""
         self._advance_world()
-        self._published[self.counts.produced - 1].end_ns = self._clock.now_ns()
+        self._answers.end_cycle(self.counts.produced - 1, self._clock.now_ns())
         answered = self._in_force.source is ActionSource.POLICY
         self.counts.unanswered += not answered
         outcome = self._task.outcome()
@@ -248,12 +192,12 @@ class RobotBridge:
             self._take_actions()
             if self._clock.now_ns() - published_ns >= REPUBLISH_NS:
                 published_ns = self._clock.now_ns()
-                self._journal.republish(self._payload)
+                self._time_steps.republish()
         return True
 
     def _sleep_until(self, deadline_ns: int) -> None:
         with self._service.wake:
-            if not (self._actions or self._must_stop() or self._service.stopping.is_set()):
+            if not (self._answers or self._must_stop() or self._service.stopping.is_set()):
                 self._clock.wait_until(deadline_ns, self._service.wake)
 
     def _count_cycle(self) -> None:
@@ -281,8 +225,8 @@ class RobotBridge:
     def _take_actions(self) -> None:
         if self._must_stop():
             self._stop_robot()
-        for arrived in self._actions.take():
-            if self._is_wanted(arrived):
+        for arrived, published_ns in self._answers.take():
+            if self._is_wanted(arrived, published_ns):
                 self._apply(arrived)
             else:
                 self.counts.refused_actions += 1
@@ -291,38 +235,14 @@ class RobotBridge:
         """True if a latch has been set that the robot does not know of yet."""
         return self._watchdog.latched is not None and self._in_force.source is not ActionSource.STOP
 
-    def _is_wanted(self, arrived: Arrived[Action]) -> bool:
-        """Count and record an action that answers this attempt; True if it is to be applied."""
-        action = arrived.message
-        step = self._published.get(action.answered_seq)
-        if action.incarnation != self._service.incarnation or step is None:
-            return False  # An earlier bridge's, or too old to tell anything.
-        if action.actor_incarnation < self._actor_incarnation:
-            return False
-        self._actor_incarnation = action.actor_incarnation
-        if not step.answered:
-            self._record_answer(step, arrived)
+    def _is_wanted(self, arrived: Arrived[Action], published_ns: int) -> bool:
+        """True for a fresh answer to this attempt, newer than what is in force."""
         newest_answered = max(self._in_force.answered_seq, self._attempt_first_seq - 1)
-        if action.answered_seq <= newest_answered:
+        if arrived.message.answered_seq <= newest_answered:
             return False
         if not self._realtime:
             return self._watchdog.latched is None
-        return self._watchdog.accept(step.published_ns, arrived.at_ns)
-
-    def _record_answer(self, step: PublishedStep, arrived: Arrived[Action]) -> None:
-        step.answered = True
-        late = step.end_ns is not None and arrived.at_ns > step.end_ns
-        self.counts.late_actions += late
-        self._service.record.row(
-            "actions",
-            {
-                "incarnation": arrived.message.incarnation,
-                "answered_seq": arrived.message.answered_seq,
-                "published_ns": step.published_ns,
-                "arrived_ns": arrived.at_ns,
-                "late": int(late),
-            },
-        )
+        return self._watchdog.accept(published_ns, arrived.at_ns)
 
     def _apply(self, arrived: Arrived[Action]) -> None:
         self._engaged = True
@@ -347,39 +267,15 @@ class RobotBridge:
     # ------------------------------------------------------------------ observations
 
     def _observe(self, reward: float, terminated: bool, truncated: bool) -> None:
-        reading = self._task.read()
-        if not (np.isfinite(reading.proprioception).all() and np.isfinite(reward)):
-            raise ServiceError(f"a sensor gave {reading.proprioception}, reward {reward}: expected finite numbers")
-        first = self._ledger.step_index == 0
-        command, totals, now_ns = self._in_force, self._ledger.totals, self._clock.now_ns()
-        by_actor = command.source in (ActionSource.POLICY, ActionSource.HELD) and not first
-        time_step = TimeStep(
-            incarnation=self._service.incarnation,
-            seq=self.counts.produced,
-            episode=self._ledger.episode,
-            attempt=self._ledger.attempt,
-            step_index=self._ledger.step_index,
-            published_ns=now_ns,
-            frame_ids=reading.frame_ids,
-            frame_capture_ns=reading.frame_capture_ns,
-            frames=reading.frames,
-            proprioception=reading.proprioception,
-            action=command.action,
-            action_source=ActionSource.NONE if first else command.source,
-            answered_seq=command.answered_seq if by_actor else -1,
-            action_applied_ns=0 if first else command.applied_ns,
+        time_step = self._time_steps.publish(
+            self._task.read(),
+            self._in_force,
+            self._ledger,
             reward=reward,
             terminated=terminated,
             truncated=truncated,
-            steps=totals.steps,
-            acted_steps=totals.acted_steps,
         )
-        if not time_step.is_last:
-            self._published[time_step.seq] = PublishedStep(now_ns)
-        self._published.pop(time_step.seq - REMEMBERED_STEPS, None)
-        self._payload = encode(time_step)
-        self.counts.produced += 1
-        self._journal.put(time_step.seq, self._payload)
+        self._answers.expect(time_step)
 
     # ------------------------------------------------------------------ beginning and end
 
@@ -429,7 +325,7 @@ class RobotBridge:
                 sent_ns = self._clock.now_ns()
                 self._finished_publisher.put(finished)
 
-        self._service.drain(lambda: self._journal.unacknowledged == 0, work)
+        self._service.drain(lambda: self._time_steps.journal.unacknowledged == 0, work)
 
     def _record_episode(self, episode: EpisodeResult) -> None:
         self._last_return = episode.undiscounted_return
@@ -465,9 +361,9 @@ class RobotBridge:
         return {
             **asdict(self._ledger.totals),
             **asdict(self.counts),
-            "resent": self._journal.resent,
-            "unacknowledged": self._journal.unacknowledged,
-            "given_up": self._journal.given_up,
+            "resent": self._time_steps.journal.resent,
+            "unacknowledged": self._time_steps.journal.unacknowledged,
+            "given_up": self._time_steps.journal.given_up,
             "stops": self._watchdog.stops,
             **({} if self._last_return is None else {"last_return": self._last_return}),
         }

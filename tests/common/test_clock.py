@@ -125,7 +125,7 @@ def test_waiting_on_the_fake_clock_takes_exactly_the_time_to_the_deadline():
 def test_the_system_clock_goes_on():
     clock = SystemClock()
     before = clock.now_ns()
-    assert 0 <= clock.now_ns() - before
+    assert clock.now_ns() >= before
 
 
 def test_the_system_clock_does_not_wait_for_what_has_passed():

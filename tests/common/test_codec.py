@@ -127,7 +127,7 @@ def example(cls):
     return random_message(cls, np.random.default_rng(5), WITH_CAMERA)
 
 
-# ---------------------------------------------------------------------------------------------------- round trips
+# ------------------------------------------------------------------ round trips
 
 
 @pytest.mark.parametrize("dimensions", [WITH_CAMERA, WITHOUT_CAMERA], ids=["camera", "no camera"])
@@ -198,7 +198,7 @@ def test_an_integer_is_accepted_where_a_number_is_wanted():
     assert type(decoded.reward) is float
 
 
-# ---------------------------------------------------------------------------------------------------- the envelope
+# ------------------------------------------------------------------ the envelope
 
 
 @pytest.mark.parametrize("version", [SCHEMA_VERSION + 1, 0, -1, None, "1", 1.5, True, [1], {}])
@@ -270,7 +270,7 @@ def test_bytes_that_are_no_message_are_refused(payload):
         decode(payload, Command)
 
 
-# ---------------------------------------------------------------------------------------------------- fields
+# ------------------------------------------------------------------ fields
 
 
 @every_message
@@ -465,7 +465,7 @@ def test_an_error_stays_short_however_long_what_came_is():
     assert len(str(caught.value)) < 1000
 
 
-# ---------------------------------------------------------------------------------------------------- at random
+# ------------------------------------------------------------------ at random
 
 
 def decodes_or_is_refused(payload, cls, dimensions):
@@ -551,7 +551,7 @@ def _put(values, path, value):
     values[last] = value
 
 
-# ---------------------------------------------------------------------------------------------------- never pickle
+# ------------------------------------------------------------------ never pickle
 
 
 def test_nothing_that_a_peer_sends_is_unpickled():

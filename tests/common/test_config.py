@@ -68,7 +68,7 @@ def test_what_is_not_given_has_its_default(tmp_path):
 def test_every_kind_of_value_is_read(tmp_path):
     config = load(
         tmp_path,
-        '[arm]\nname = "left"\njoints = 7\nspeed = 1.5\ngrip = true\nmode = "stiff"\npeers = ["a", "b"]\n'
+        '[arm]\nname = "left"\njoints = 7\nspeed = 1.5\ngrip = true\ntouch = "stiff"\npeers = ["a", "b"]\n'
         '[extra]\npreset = "demo"\n',
     )
     assert config.arm == Arm("left", 7, 1.5, grip=True, touch="stiff", peers=["a", "b"])
@@ -174,7 +174,7 @@ def test_rests_are_not_shared():
     assert Extra().overrides is not Extra().overrides
 
 
-# ---------------------------------------------------------------------------------------------------- files
+# ------------------------------------------------------------------ files
 
 
 @pytest.mark.parametrize("text", ["[arm", "name = \n", "[arm]\nname = left\n", "[arm]\n[arm]\n", "\0"])
@@ -204,7 +204,7 @@ def test_a_folder_is_no_file(tmp_path):
         load_config(ArmConfig, tmp_path)
 
 
-# ---------------------------------------------------------------------------------------------------- --set
+# ------------------------------------------------------------------ --set
 
 
 @pytest.mark.parametrize(
@@ -266,7 +266,7 @@ def test_an_override_of_an_unknown_section_is_named_as_it_was_typed(tmp_path):
     assert error == "--set amr.joints=2: no section [amr]; did you mean 'arm'?"
 
 
-# ---------------------------------------------------------------------------------------------------- round trips
+# ------------------------------------------------------------------ round trips
 
 
 def test_a_configuration_becomes_tables_and_comes_back():

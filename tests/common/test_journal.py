@@ -23,7 +23,7 @@ S = 1_000_000_000
 MS = 1_000_000
 
 
-# ---------------------------------------------------------------------------------------------------- the sender holds
+# ------------------------------------------------------------------ the sender holds
 
 
 def retained(count=0, max_age_s=60.0, max_bytes=10_000, size=10, every_s=1.0):
@@ -136,7 +136,7 @@ def test_an_acknowledgement_while_resending_ends_it():
     assert [payload[0] for payload in due] == [4]
 
 
-# ---------------------------------------------------------------------------------------------------- the receiver orders
+# ------------------------------------------------------------------ the receiver orders
 
 
 def received(*numbers, stream=1, head=None, receiver=None):
@@ -377,7 +377,7 @@ def test_a_head_that_contradicts_itself_never_lowers_the_losses():
     assert receiver.lost == 8
 
 
-# ---------------------------------------------------------------------------------------------------- both, at random
+# ------------------------------------------------------------------ both, at random
 
 
 class LossyWay:
@@ -445,7 +445,7 @@ def test_every_message_is_handed_on_in_order_or_counted_as_lost(seed, max_bytes)
         assert handed_on == list(range(sender.next_seq))
 
 
-# ---------------------------------------------------------------------------------------------------- the sender's thread
+# ------------------------------------------------------------------ the sender's thread
 
 
 class ReceivingSide:

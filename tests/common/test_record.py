@@ -50,7 +50,7 @@ def points(folder):
     ]
 
 
-# ---------------------------------------------------------------------------------------------------- parts
+# ------------------------------------------------------------------ parts
 
 
 def test_a_part_says_whose_it_is_and_what_was_given(started, tmp_path):
@@ -135,7 +135,7 @@ def test_a_part_that_cannot_be_read_is_left_out_and_told(tmp_path, caplog, conte
     assert "actor-2.json: left out of the record" in caplog.text
 
 
-# ---------------------------------------------------------------------------------------------------- tables
+# ------------------------------------------------------------------ tables
 
 
 def test_rows_follow_a_header_of_their_columns(started, tmp_path):
@@ -196,7 +196,7 @@ def test_a_row_is_written_as_it_was_when_it_was_given(started, tmp_path):
     assert table(tmp_path / "episodes.csv") == [["a"], ["1"]]
 
 
-# ---------------------------------------------------------------------------------------------------- metrics
+# ------------------------------------------------------------------ metrics
 
 
 def test_metrics_are_rows_and_points(started, tmp_path):
@@ -247,7 +247,7 @@ def test_the_record_costs_no_service_an_import_of_torch(tmp_path):
     run_program(program, tmp_path)
 
 
-# ---------------------------------------------------------------------------------------------------- a disk that refuses
+# ------------------------------------------------------------------ a disk that refuses
 
 
 def refuse(*_, **__):

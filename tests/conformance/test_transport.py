@@ -111,7 +111,7 @@ def opened():
         transport.close()
 
 
-# ---------------------------------------------------------------------------------------------------- publications
+# ------------------------------------------------------------------ publications
 
 
 @pytest.mark.parametrize("topic", [topics.ACTION, topics.TIME_STEP, topics.EXPERIENCE, topics.POLICY, topics.CREDIT])
@@ -206,7 +206,7 @@ def test_many_threads_may_put(mesh):
         assert len(arrived) == 40
 
 
-# ---------------------------------------------------------------------------------------------------- late joiners
+# ------------------------------------------------------------------ late joiners
 
 
 def test_a_cached_message_reaches_whoever_subscribes_later(mesh):
@@ -260,7 +260,7 @@ def test_a_cached_message_is_gone_with_its_publisher(mesh):
     assert ears.payloads == [b"new"]
 
 
-# ---------------------------------------------------------------------------------------------------- queries
+# ------------------------------------------------------------------ queries
 
 
 def answered(transport, topic=topics.SPEC, payload=b""):
@@ -319,7 +319,7 @@ def test_nobody_answers_for_who_has_left(mesh):
     eventually(lambda: there.query(topics.SPEC, timeout_s=0.2) is None, "silence")
 
 
-# ---------------------------------------------------------------------------------------------------- counting
+# ------------------------------------------------------------------ counting
 
 
 def test_payload_bytes_are_counted_by_topic_on_both_sides(mesh):
@@ -351,7 +351,7 @@ def test_queries_are_not_counted(mesh):
     assert [*here.bytes_sent, *here.bytes_received, *there.bytes_sent, *there.bytes_received] == []
 
 
-# ---------------------------------------------------------------------------------------------------- leaving
+# ------------------------------------------------------------------ leaving
 
 
 def test_closing_twice_is_no_error(mesh):
@@ -378,7 +378,7 @@ def test_who_has_left_hears_nothing_and_the_others_go_on(mesh):
     assert gone.payloads == [b"before"]
 
 
-# ---------------------------------------------------------------------------------------------------- Zenoh: endpoints
+# ------------------------------------------------------------------ Zenoh: endpoints
 
 
 @pytest.mark.parametrize("lane", ["real_time", "bulk"])
@@ -444,7 +444,7 @@ def test_an_address_of_another_computer_is_named(opened):
         opened(endpoints.settings())
 
 
-# ---------------------------------------------------------------------------------------------------- Zenoh: the mesh
+# ------------------------------------------------------------------ Zenoh: the mesh
 
 
 def test_an_unreachable_peer_is_no_error_and_is_met_when_it_comes(opened):

@@ -49,7 +49,7 @@ def load_task(
     if preset not in task_class.PRESETS:
         raise ConfigError(f"[task] preset = {preset!r}: task {name} has the presets {', '.join(task_class.PRESETS)}")
     values = {**task_class.PRESETS[preset], **(overrides or {})}
-    settings = build_section(task_class.SETTINGS, values, f"[task] {name}")
+    settings: Any = build_section(task_class.SETTINGS, values, f"[task] {name}")
     return task_class(settings, name=name, preset=preset, pacing=pacing, rng=rng)
 
 

@@ -88,7 +88,7 @@ class NoiseFrames(Task):
         ids = np.arange(self._next_frame_id, self._next_frame_id + count)
         self._next_frame_id += count
         return SensorReading(
-            frames=np.stack([self._draw(frame_id) for frame_id in ids]) if count else np.zeros((0, *self._shape), "u1"),
+            frames=np.stack([self._draw(int(frame_id)) for frame_id in ids]) if count else np.zeros((0, *self._shape), "u1"),
             frame_ids=ids.astype(np.int64),
             frame_capture_ns=np.full(count, self._now_ns, np.int64),
             proprioception=self._command,
@@ -99,7 +99,7 @@ class NoiseFrames(Task):
 
     def _draw(self, frame_id: int) -> UInt8Array:
         frame = self._rng.integers(0, 256, self._shape, np.uint8)
-        frame.reshape(-1)[:_ID_BYTES] = np.frombuffer(int(frame_id).to_bytes(_ID_BYTES, "little"), np.uint8)
+        frame.reshape(-1)[:_ID_BYTES] = np.frombuffer(frame_id.to_bytes(_ID_BYTES, "little"), np.uint8)
         return frame
 
 

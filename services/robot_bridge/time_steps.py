@@ -1,0 +1,94 @@
+"""TimeSteps out, numbered and retained until the actor has them; and what led into each of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common import topics
+from common.codec import encode
+from common.errors import ServiceError
+from common.journal import JournalSender
+from common.messages import ActionSource, Float32Array, TimeStep
+from common.service import Service
+from services.robot_bridge.bookkeeping import CycleCounts, Ledger
+from services.robot_bridge.config import RobotBridgeSettings
+from services.robot_bridge.tasks.base import SensorReading
+
+
+@dataclass(frozen=True)
+class CommandInForce:
+    """The robot's command and where it came from."""
+
+    action: Float32Array
+    source: ActionSource
+    answered_seq: int
+    applied_ns: int
+
+
+class TimeStepStream:
+    """Builds, numbers and publishes the TimeSteps of this incarnation."""
+
+    def __init__(self, service: Service, settings: RobotBridgeSettings, counts: CycleCounts) -> None:
+        self._service, self._counts = service, counts
+        self._payload = b""
+        self.journal = JournalSender(
+            service.transport,
+            service.incarnation,
+            settings,
+            topic=topics.TIME_STEP,
+            resent=topics.TIME_STEP_RESENT,
+            head=topics.TIME_STEP_HEAD,
+            acknowledgement=topics.TIME_STEP_ACK,
+            clock=service.clock,
+        )
+
+    def publish(
+        self,
+        reading: SensorReading,
+        command: CommandInForce,
+        ledger: Ledger,
+        *,
+        reward: float,
+        terminated: bool,
+        truncated: bool,
+    ) -> TimeStep:
+        """Publish what the sensors show now and what led to it.
+
+        Raises:
+            ServiceError: a sensor or the reward is not finite; nothing was published.
+        """
+        if not (np.isfinite(reading.proprioception).all() and np.isfinite(reward)):
+            raise ServiceError(f"a sensor gave {reading.proprioception}, reward {reward}: expected finite numbers")
+        first = ledger.step_index == 0
+        by_actor = command.source in (ActionSource.POLICY, ActionSource.HELD) and not first
+        time_step = TimeStep(
+            incarnation=self._service.incarnation,
+            seq=self._counts.produced,
+            episode=ledger.episode,
+            attempt=ledger.attempt,
+            step_index=ledger.step_index,
+            published_ns=self._service.clock.now_ns(),
+            frame_ids=reading.frame_ids,
+            frame_capture_ns=reading.frame_capture_ns,
+            frames=reading.frames,
+            proprioception=reading.proprioception,
+            action=command.action,
+            action_source=ActionSource.NONE if first else command.source,
+            answered_seq=command.answered_seq if by_actor else -1,
+            action_applied_ns=0 if first else command.applied_ns,
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            steps=ledger.totals.steps,
+            acted_steps=ledger.totals.acted_steps,
+        )
+        self._payload = encode(time_step)
+        self._counts.produced += 1
+        self.journal.put(time_step.seq, self._payload)
+        return time_step
+
+    def republish(self) -> None:
+        """Publish the newest TimeStep once more."""
+        self.journal.republish(self._payload)
