@@ -38,6 +38,8 @@ RECORD_S = 1.0
 """Period of the part and the metrics."""
 GONE_AFTER_S = 1.5
 """A peer whose last status is older than this counts as gone."""
+OUTAGE_S = 5.0
+"""At the end of a run, a peer that has been silent for less than this is waited for."""
 DRAIN_TIMEOUT_S = 30.0
 """Longest time a service waits at the end for messages that are still on their way."""
 CLOSE_TIMEOUT_S = 1.0
@@ -147,9 +149,9 @@ class Service:
             return float("inf")
         return (self.clock.now_ns() - peer.at_ns) / 1e9
 
-    def peer_state(self, service: str) -> str:
+    def peer_state(self, service: str, gone_after_s: float = GONE_AFTER_S) -> str:
         """State of ``service``; ``gone`` if nothing was heard of it for a while."""
-        return self._peers[service].status.state if self.peer_age_s(service) < GONE_AFTER_S else "gone"
+        return self._peers[service].status.state if self.peer_age_s(service) < gone_after_s else "gone"
 
     def peer_counter(self, service: str, name: str) -> float:
         """A count that ``service`` last reported; 0 before it did."""
@@ -219,7 +221,9 @@ class Service:
         return self.stopping.is_set() or (self._finished is not None and self._finished.reason != "steps")
 
     def _peer_states(self) -> dict[str, str]:
-        return {name: self.peer_state(name) for name in topics.SERVICES if name != self.name}
+        # The network may be silent just now: whoever waits there may still need what this service has.
+        patience_s = GONE_AFTER_S if self._ends_early() else OUTAGE_S
+        return {name: self.peer_state(name, patience_s) for name in topics.SERVICES if name != self.name}
 
     def _beat(self) -> None:
         next_status_ns = next_record_ns = 0

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import logging
+
 from threadpoolctl import threadpool_limits
 
 from common import topics
 from common.algorithms.presets import resolve_config
 from common.policies import initial_policy
+from common.priority import run_before_others
 from common.service import Service, end_process, run_service
 from services.actor.actor import Actor
 from services.actor.config import ActorConfig
+
+logger = logging.getLogger(__name__)
 
 
 def serve(service: Service, config: ActorConfig) -> None:
@@ -28,7 +33,11 @@ def serve(service: Service, config: ActorConfig) -> None:
         name, config.algorithm.preset or spec.algorithm_presets.get(name, ""), config.algorithm.overrides
     )
     policy = initial_policy(spec, algorithm.hidden_size, algorithm.encoder_strides, config.run.seed)
-    Actor(service, spec, policy, config.actor).run()
+    actor = Actor(service, spec, policy, config.actor)
+    if config.actor.real_time_priority and spec.pacing == "realtime":
+        # Not before torch has been imported, which is seconds of computing.
+        logger.info("%s", run_before_others())
+    actor.run()
 
 
 if __name__ == "__main__":

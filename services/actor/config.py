@@ -14,6 +14,8 @@ class ActorSettings(JournalSettings):
 
     threads: int = setting(1, low=1, high=64)
     """Threads of one policy evaluation."""
+    real_time_priority: bool = setting(True)
+    """Run before ordinary processes, where the system allows it; not in lockstep."""
     lockstep_surplus: float = setting(2.0, low=0.0)
     """In lockstep, the actor waits while replay has more unspent updates than this."""
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from common import topics
+from common.priority import run_before_others
 from common.record import read_parts
 from common.service import Service, end_process, run_service
 from services.robot_bridge.bookkeeping import Totals
@@ -31,7 +32,10 @@ def serve(service: Service, config: RobotBridgeConfig) -> None:
         # A restarted bridge must not repeat the starts of the one before.
         rng=np.random.default_rng([config.run.seed, totals.attempts]),
     )
-    RobotBridge(service, task, settings, totals).run()
+    bridge = RobotBridge(service, task, settings, totals)
+    if settings.real_time_priority and settings.pacing == "realtime":
+        logger.info("%s", run_before_others())
+    bridge.run()
 
 
 def _earlier_totals(directory: Path) -> Totals:

@@ -129,7 +129,7 @@ class RobotBridge:
         if answered:
             self._in_force = replace(self._in_force, source=ActionSource.HELD)
         elif self._settings.on_missing_action == "zero" and self._in_force.source is ActionSource.HELD:
-            self._command(np.zeros_like(self._in_force.action), ActionSource.ZERO, -1)
+            self._command(np.zeros_like(self._in_force.action), ActionSource.ZERO, self._in_force.answered_seq)
         if episode:
             self._record_episode(episode)
         self._needs_new_goal = outcome.terminated or episode is not None

@@ -39,6 +39,8 @@ class RobotBridgeSettings(JournalSettings):
     """At the end of a cycle without an action: ``hold`` the last command, command ``zero``, or ``wait`` for it."""
     stop_after: float = setting(0.5, low=0.01, high=60.0)
     """The watchdog stops the robot after this long without a fresh action, seconds."""
+    real_time_priority: bool = setting(True)
+    """Run before ordinary processes, where the system allows it; not in lockstep."""
     peer_grace: float = setting(5.0, low=0.1, high=3600.0)
     """No attempt starts when actor or replay has not been heard of for this long, seconds."""
 

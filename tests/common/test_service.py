@@ -29,6 +29,7 @@ from common.service import (
     DRAIN_TIMEOUT_S,
     GONE_AFTER_S,
     HEARTBEAT_S,
+    OUTAGE_S,
     RECORD_S,
     STOP_TIMEOUT_S,
     Service,
@@ -459,7 +460,10 @@ def test_a_peer_that_is_gone_holds_nobody_up(scene, end):
         if end == "goodbye":
             scene.say(status("actor", state="stopped"))
         else:
+            # In an outage a peer is silent, too, and still needs this service.
             scene.clock.advance(GONE_AFTER_S)
+            assert replay.peer_state("actor") == "gone"
+            scene.clock.advance(OUTAGE_S)
     assert results == [True]
 
 
@@ -680,7 +684,7 @@ def serve(service, config):
 
 sys.exit(run_service("actor", TinyConfig, serve, sys.argv[1:]))
 """
-WAIT = "service.stopping.wait()"
+WAIT = "while not service.stopping.wait(1.0): pass"
 SPIN = "while not service.stopping.wait(0): pass"
 LOOP = """while not service.stopping.is_set():
         with service.wake:

@@ -216,7 +216,7 @@ def test_a_cached_message_reaches_whoever_subscribes_later(mesh):
         publisher.put(version)
     ears = Ears(there, topics.POLICY)
     ears.wait_for(b"2")
-    assert ears.payloads == [b"2"]
+    assert ears.payloads[-1] == b"2"
 
 
 def test_a_cached_message_reaches_whoever_joins_later(mesh):

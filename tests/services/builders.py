@@ -129,7 +129,7 @@ class SoloService(Service):
     def peer_age_s(self, service) -> float:
         return self.ages_s.get(service, 0.0) if service in self.peers else float("inf")
 
-    def peer_state(self, service) -> str:
+    def peer_state(self, service, gone_after_s=0.0) -> str:
         return self.peers.get(service, "gone")
 
     def peer_counter(self, service, name) -> float:

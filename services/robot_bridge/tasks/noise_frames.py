@@ -88,7 +88,9 @@ class NoiseFrames(Task):
         ids = np.arange(self._next_frame_id, self._next_frame_id + count)
         self._next_frame_id += count
         return SensorReading(
-            frames=np.stack([self._draw(int(frame_id)) for frame_id in ids]) if count else np.zeros((0, *self._shape), "u1"),
+            frames=np.stack([self._draw(int(frame_id)) for frame_id in ids])
+            if count
+            else np.zeros((0, *self._shape), "u1"),
             frame_ids=ids.astype(np.int64),
             frame_capture_ns=np.full(count, self._now_ns, np.int64),
             proprioception=self._command,

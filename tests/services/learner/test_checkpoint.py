@@ -1,6 +1,7 @@
 """A checkpoint that cannot be used is an error that names it; a disk that cannot be written is not."""
 
 import io
+import threading
 
 import numpy as np
 import pytest
@@ -8,8 +9,9 @@ import pytest
 from common.algorithms.presets import SACConfig
 from common.algorithms.sac import SAC
 from common.errors import ConfigError
+from services.learner import checkpoint as checkpoints
 from services.learner.checkpoint import CHECKPOINT_FILE, POLICY_FILE, CheckpointWriter, restore
-from tests.helpers import make_spec
+from tests.helpers import TIMEOUT_S, make_spec
 
 SPEC = make_spec(camera=False)
 
@@ -94,6 +96,28 @@ def test_the_last_of_several_checkpoints_is_what_remains(tmp_path):
         writer.write(algorithm.policy_weights(version, "float32"), algorithm.state_dict())
     writer.close()
     assert restore(tmp_path, make_algorithm()) == 5
+
+
+def test_while_one_is_written_the_next_ones_replace_each_other(tmp_path, monkeypatch):
+    algorithm, replace = make_algorithm(), checkpoints._replace
+    begun, go_on, written = threading.Event(), threading.Event(), []
+
+    def slow_replace(path, content):
+        begun.set()
+        assert go_on.wait(TIMEOUT_S)
+        written.append(path.name)
+        replace(path, content)
+
+    monkeypatch.setattr(checkpoints, "_replace", slow_replace)
+    writer = CheckpointWriter(tmp_path)
+    writer.write(algorithm.policy_weights(1, "float32"), algorithm.state_dict())
+    assert begun.wait(TIMEOUT_S)
+    for version in (2, 3, 4):
+        writer.write(algorithm.policy_weights(version, "float32"), algorithm.state_dict())
+    go_on.set()
+    writer.close()
+    assert written == [POLICY_FILE, CHECKPOINT_FILE] * 2
+    assert restore(tmp_path, make_algorithm()) == 4
 
 
 def test_a_disk_that_cannot_be_written_is_logged_and_does_not_end_the_learner(tmp_path, caplog):

@@ -93,6 +93,14 @@ def test_zero_takes_the_command_back_at_the_end_of_a_cycle_without_an_answer(tmp
     assert in_force(sixth) == (POLICY, 5, 0.17)
 
 
+def test_after_a_zero_command_nothing_is_applied_that_is_older_than_the_last_answer(tmp_path):
+    scene = Scene(tmp_path, answers_by_seq(s1=0.13, s2=[0.01, 0.1]), steps=4, on_missing_action="zero")
+    scene.run()
+    assert in_force(scene.time_steps[4]) == (HELD, 2, 0.05)
+    assert in_force(scene.time_steps[5]) == (ZERO, -1, 0.12)
+    assert scene.counts.refused_actions == 2
+
+
 def test_an_action_that_comes_after_its_cycle_is_late_and_still_applied_if_it_is_the_newest(tmp_path):
     scene = Scene(tmp_path, answers_by_seq(s1=0.05), steps=3)
     _, _, second, third, fourth = scene.run()
@@ -115,6 +123,15 @@ def test_an_action_at_the_very_deadline_is_in_time(tmp_path):
     scene = Scene(tmp_path, answers_by_seq(s1=0.04), steps=1)
     second = scene.run()[2]
     assert in_force(second) == (POLICY, 1, 0.04)
+    assert scene.counts.late_actions == 0
+
+
+def test_an_action_that_arrives_at_the_deadline_and_is_read_later_was_in_time(tmp_path):
+    scene = Scene(tmp_path, answers=None, steps=2)
+    scene.task.on_outcome = {1: lambda: scene.answer(1)}  # while the bridge judges the cycle
+    _, _, second, third = scene.run()
+    assert second.action_source is ZERO
+    assert in_force(third) == (POLICY, 1, 0.04)
     assert scene.counts.late_actions == 0
 
 
@@ -247,7 +264,7 @@ def test_overruns_after_the_warm_up_are_counted_by_themselves(tmp_path):
 
 
 def test_an_action_older_than_the_memory_is_not_even_late(tmp_path):
-    scene = Scene(tmp_path, answers=0.01, steps=300)
+    scene = Scene(tmp_path, answers=lambda t: None if t.seq == 1 else 0.01, steps=300)
     scene.clock.at(299 * 0.04 + 0.02, lambda: scene.answer(1))
     scene.run()
     assert scene.counts.late_actions == 0

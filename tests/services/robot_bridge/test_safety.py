@@ -39,6 +39,13 @@ def test_the_watchdog_runs_from_the_attempts_beginning(tmp_path):
     assert sources(scene) == [ActionSource.ZERO, ActionSource.ZERO, STOP, STOP]
 
 
+def test_a_reset_that_takes_longer_than_the_watchdogs_time_does_not_stop_the_next_attempt(tmp_path):
+    scene = Scene(tmp_path, answers=0.03, task={"time_limit": 2, "reset_steps": 20}, steps=26, stop_after=0.1)
+    scene.run()
+    assert sources(scene) == [POLICY] * 4
+    assert scene.service.counters()["stops"] == 0
+
+
 def test_a_fresh_action_sets_a_stopped_robot_going_again(tmp_path):
     scene = Scene(tmp_path, only(1, 6), steps=8, stop_after=0.1)
     scene.run()
@@ -74,6 +81,20 @@ def test_a_stop_command_stops_the_robot_at_once_and_keeps_it_stopped(tmp_path, n
     assert scene.service.counters()["stops"] == 0  # no want of actions
 
 
+def test_a_stop_command_that_comes_as_the_bridge_goes_to_sleep_is_not_slept_over(tmp_path):
+    scene = Scene(tmp_path, answers=0.01, steps=1)
+    expire = scene.bridge._watchdog.expire
+
+    def stop_meanwhile(now_ns):  # after the bridge has looked for commands, before it sleeps
+        if now_ns == START_NS + 10_000_000:
+            scene.command("e_stop")
+        return expire(now_ns)
+
+    scene.bridge._watchdog.expire = stop_meanwhile
+    scene.run()
+    assert 0.01 in scene.task.times("stop")
+
+
 def test_a_pause_does_not_lift_an_emergency_stop_and_resume_does(tmp_path):
     scene = Scene(tmp_path, answers=0.01, steps=6)
     scene.clock.at(0.02, lambda: scene.command("e_stop"))
@@ -82,6 +103,18 @@ def test_a_pause_does_not_lift_an_emergency_stop_and_resume_does(tmp_path):
     scene.run()
     assert sources(scene) == [STOP, STOP, STOP, STOP, POLICY, POLICY]
     assert scene.task.times("command") == pytest.approx([0.0, 0.01, 0.17, 0.21])
+
+
+def test_what_was_answered_before_a_stop_is_not_applied_again_after_it(tmp_path):
+    scene = Scene(tmp_path, answers=None, steps=2)
+    scene.clock.at(0.045, lambda: scene.answer(2))
+    scene.clock.at(0.05, lambda: scene.command("pause"))
+    scene.clock.at(0.055, lambda: scene.command("resume"))
+    scene.clock.at(0.06, lambda: scene.answer(1))
+    scene.clock.at(0.06, lambda: scene.answer(2))
+    scene.run()
+    assert sources(scene) == [ActionSource.ZERO, STOP]
+    assert scene.task.times("command") == pytest.approx([0.0, 0.045])
 
 
 def test_no_attempt_starts_while_the_robot_is_to_stand_still(tmp_path):
