@@ -193,6 +193,9 @@ class ZenohTransport:
             "transport/link/tx/lease": LEASE_MS,
             "transport/link/tx/keep_alive": 4,
             "timestamping/enabled": True,
+            # How long a put of a message of several fragments may wait for room before it is dropped: 50 ms by
+            # default, more than an action cycle.
+            "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 2000,
         }
         if settings.socket_buffer_kib:
             values["transport/link/tcp/so_sndbuf"] = settings.socket_buffer_kib * 1024
