@@ -24,8 +24,10 @@ from common.topics import Delivery, Lane, Topic
 PayloadCallback = Callable[[bytes], None]
 Answer = Callable[[bytes], bytes]
 
-LEASE_MS = 1000
-"""A peer that sent nothing for this long is gone; also how long an outage must last to close connections."""
+LEASE_MS = 3000
+"""A connection over which nothing came for this long is closed and opened anew. Longer than a short outage: TCP's
+retransmission is back .1 to .4 s after a second of silence, a new connection, whose first packet was lost, after 1.1
+to 1.5 s. Who is gone is told by the status messages, not by this."""
 
 
 class Publisher(Protocol):

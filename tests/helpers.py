@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+import os
 import socket
 import time
 from collections.abc import Callable
@@ -16,6 +19,8 @@ from tests.reference import tasks
 
 TIMEOUT_S = 30.0
 """How long a test waits for another thread before it fails; never how long it takes."""
+_PORTS = itertools.islice(itertools.cycle(range(20_000, 32_000)), 7 * os.getpid() % 12_000, None)
+"""Below those that the system gives to connections: one of them could take the port in between."""
 
 
 def make_spec(camera: bool = True, **changes: Any) -> TaskSpec:
@@ -68,10 +73,13 @@ def make_run(directory: object = "unused", run: str = "test", robot: str = "robo
 
 
 def free_port() -> int:
-    """Return a TCP port that nobody listens on at 127.0.0.1."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """Return a TCP port that nobody listens on at 127.0.0.1, each only once."""
+    for port in _PORTS:
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise AssertionError("there is no free port")
 
 
 def eventually(holds: Callable[[], object], what: str = "it") -> None:
