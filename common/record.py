@@ -111,7 +111,8 @@ class RunRecord:
     def _write(self, entry: Callable[[], None]) -> None:
         try:
             entry()
-        except OSError as error:
+        except Exception as error:
+            # Whatever it is, the record must not end with it, and the service even less.
             self.dropped += 1
             if self.dropped == 1:
                 logger.error("%s: the record cannot be written: %s", self.directory, error)

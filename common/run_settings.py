@@ -23,7 +23,8 @@ class RunSettings:
     robot: str = setting("robot0")
     """Name of the robot: the third part of every key expression."""
     seed: int = setting(0, low=0, high=2**31 - 1)
-    """Seed of everything random in the run."""
+    """Seed of the task, the initial networks and the updates. What a restart must not repeat (exploration, sampling)
+    is seeded with the service's start time as well."""
 
     def __post_init__(self) -> None:
         for name in ("id", "robot"):

@@ -130,7 +130,7 @@ class Service:
         if self._heart.is_alive():
             self._heart.join()
         self._send_status()
-        self._write_record()
+        self.write_record()
         self.record.close()
         # Zenoh tries for long to say goodbye over a dead link; nobody is there who could hear it.
         closing = threading.Thread(target=self.transport.close, name="close", daemon=True)
@@ -240,7 +240,7 @@ class Service:
                 self._send_status()
             if now_ns >= next_record_ns:
                 next_record_ns = now_ns + round(RECORD_S * 1e9)
-                self._write_record()
+                self.write_record()
 
     def _take_messages(self) -> None:
         for status, at_ns in self._status_inbox.take():
@@ -281,7 +281,8 @@ class Service:
         status = Status(self.name, self.run.id, self.incarnation, self.state, counters)
         self._status_publisher.put(encode(status))
 
-    def _write_record(self) -> None:
+    def write_record(self) -> None:
+        """Record counts and details as they are now; done once a second without being asked."""
         counters = self.counters()
         wall_s = (self.clock.now_ns() - self.started_ns) / 1e9
         self.record.part(

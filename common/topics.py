@@ -21,7 +21,7 @@ class Delivery(Enum):
     NEWEST = "newest"
     """The receiver sees the newest message; older ones may be dropped on the way."""
     NUMBERED = "numbered"
-    """Every message, in order: sent once at once, gaps resent by :mod:`common.journal`."""
+    """Every message: gaps are noticed by number and sent again, by :mod:`common.journal` or for open credit."""
     CACHED = "cached"
     """The newest message, also for a receiver that comes later."""
     QUERY = "query"

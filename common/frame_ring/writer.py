@@ -18,8 +18,9 @@ from common.frame_ring.persisted import PersistedRanges
 from common.frame_ring.reader import read_layout
 from common.frame_ring.view import RingView
 from common.frame_stack import FrameStack, Stack
-from common.messages import Experience, TaskSpec
+from common.messages import ActionSource, Experience, TaskSpec
 
+_STOP = SOURCES.index(ActionSource.STOP)
 FRAME_MEMORY = 256
 """Frames remembered for building stacks: how late an experience may come and still get a whole stack."""
 
@@ -153,8 +154,7 @@ class RingWriter(RingView):
         self._mapped.flush()
 
     def close(self) -> None:
-        """Flush, unmap and unlock."""
-        self.flush()
+        """Unmap and unlock. What was appended outlives the process without a flush; only a power cut needs one."""
         del self._persisted
         super().close()
         os.close(self._file_descriptor)
@@ -227,6 +227,8 @@ class RingWriter(RingView):
             and row["step_index"] == before["step_index"] + 1
             and all(row[name] == before[name] for name in ("incarnation", "episode", "attempt"))
             and not (before["terminated"] or before["truncated"])
+            # A stop is no action: what it does to the robot cannot be learnt as the effect of one.
+            and row["action_source"] != _STOP
         )
 
     def _recount(self) -> None:

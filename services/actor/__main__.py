@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 from common import topics
 from common.algorithms.presets import resolve_config
 from common.policies import initial_policy
-from common.priority import run_before_others
+from common.priority import ACTOR_PRIORITY, run_before_others
 from common.service import Service, end_process, run_service
 from services.actor.actor import Actor
 from services.actor.config import ActorConfig
@@ -36,7 +36,7 @@ def serve(service: Service, config: ActorConfig) -> None:
     actor = Actor(service, spec, policy, config.actor)
     if config.actor.real_time_priority and spec.pacing == "realtime":
         # Not before torch has been imported, which is seconds of computing.
-        logger.info("%s", run_before_others())
+        logger.info("%s", run_before_others(ACTOR_PRIORITY))
     actor.run()
 
 

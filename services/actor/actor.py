@@ -86,7 +86,12 @@ class Actor:
 
     def counters(self) -> dict[str, float]:
         """Counts for the heartbeat and the record."""
-        return {"actions": self._actions, "policy_version": self._swap.policy.version, **self._forwarder.counters()}
+        return {
+            "actions": self._actions,
+            "policy_version": self._swap.policy.version,
+            "policies_received": self._swap.received,
+            **self._forwarder.counters(),
+        }
 
     def _add_frames(self, time_step: TimeStep) -> Stack[UInt8Array] | None:
         if self._stack is None or time_step.incarnation < self._newest[0]:

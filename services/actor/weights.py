@@ -23,6 +23,7 @@ class PolicySwap:
         self.policy = initial
         """The policy to act with; replaced as a whole."""
         self.received = 0
+        """Policies swapped in."""
         self._service, self._spec = service, spec
         self._wake = threading.Condition()
         self._stopping = False

@@ -31,8 +31,8 @@ logger = logging.getLogger(__name__)
 
 ACKNOWLEDGE_S = 0.1
 """Period of the acknowledgement to the actor."""
-LOST_AFTER_NS = 1_000_000_000
-"""A minibatch that the learner still misses after this long is taken for lost on the way."""
+LOST_AFTER_S = {"map": 1.0, "arrays": 15.0}
+"""A minibatch that the learner still misses after this long is taken for lost on the way; arrays may be slow."""
 ACTOR_LOST_AFTER_S = 5.0
 """At the end, what an actor still owes is waited for this long: it may be behind a network outage."""
 
@@ -67,6 +67,8 @@ class Replay:
         self._credit = Credit(0, 0, 0)
         self._sent = 0
         self._sent_ns = 0
+        self._paid = 0
+        self._lost_after_ns = round(LOST_AFTER_S[settings.access] * 1e9)
         self._sent_total = 0
         self._produced_seen: dict[int, int] = {}
         self._copies_refused = 0
@@ -165,17 +167,21 @@ class Replay:
     def _serve_credit(self) -> None:
         if arrived := self._credits.take_newest():
             self._take_credit(arrived.message)
-        while self._sent < self._credit.want_total and self._budget.spend():
+        while self._sent < self._credit.want_total and self._budget.owed >= 1.0:
             if not self._send_minibatch():
                 return
+            if self._sent > self._paid:
+                # A minibatch that is sent again, because it was lost on the way, has been paid for.
+                self._paid = self._sent
+                self._budget.spend()
 
     def _take_credit(self, credit: Credit) -> None:
         if credit.learner_incarnation < self._credit.learner_incarnation:
             return
         if credit.learner_incarnation > self._credit.learner_incarnation:
             logger.info("a learner has joined")
-            self._sent = credit.received_total
-        elif credit.received_total < self._sent and self._service.clock.now_ns() - self._sent_ns > LOST_AFTER_NS:
+            self._sent = self._paid = credit.received_total
+        elif credit.received_total < self._sent and self._service.clock.now_ns() - self._sent_ns > self._lost_after_ns:
             self._sent = credit.received_total
         self._credit = credit
 

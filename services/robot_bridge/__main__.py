@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from common import topics
-from common.priority import run_before_others
+from common.priority import BRIDGE_PRIORITY, run_before_others
 from common.record import read_parts
 from common.service import Service, end_process, run_service
 from services.robot_bridge.bookkeeping import Totals
@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 def serve(service: Service, config: RobotBridgeConfig) -> None:
     """Build the task and run the bridge."""
     settings = config.robot_bridge
-    totals = _earlier_totals(Path(config.run.directory))
+    totals, latched = _earlier(Path(config.run.directory))
     task = load_task(
         config.task.name,
         config.task.preset,
@@ -32,23 +32,27 @@ def serve(service: Service, config: RobotBridgeConfig) -> None:
         # A restarted bridge must not repeat the starts of the one before.
         rng=np.random.default_rng([config.run.seed, totals.attempts]),
     )
-    bridge = RobotBridge(service, task, settings, totals)
+    bridge = RobotBridge(service, task, settings, totals, latched)
     if settings.real_time_priority and settings.pacing == "realtime":
-        logger.info("%s", run_before_others())
+        logger.info("%s", run_before_others(BRIDGE_PRIORITY))
     bridge.run()
 
 
-def _earlier_totals(directory: Path) -> Totals:
-    """Where the last incarnation of this run's bridge was when it last wrote; at most a second is counted again."""
+def _earlier(directory: Path) -> tuple[Totals, str | None]:
+    """What the last incarnation of this run's bridge last wrote: its counts, and an emergency stop in force.
+
+    At most a second is counted again.
+    """
     # A bridge that has not come as far as its task, as this one, has written a part without counts.
     parts = [part for part in read_parts(directory, topics.ROBOT_BRIDGE) if "steps" in part.get("counters", {})]
     if not parts:
-        return Totals()
+        return Totals(), None
     counters = parts[-1]["counters"]
     names = ("steps", "acted_steps", "episodes", "attempts")
     totals = Totals(**{name: int(counters.get(name, 0)) for name in names})
     logger.warning("this run has had a robot_bridge before: going on from step %d", totals.steps)
-    return totals
+    latched = "e_stop" if parts[-1].get("latched") == "e_stop" else None
+    return totals, latched
 
 
 if __name__ == "__main__":

@@ -46,20 +46,30 @@ PEERS = (topics.ACTOR, topics.REPLAY)
 class RobotBridge:
     """Runs a task's action cycle against the actor's answers until the run's steps are done."""
 
-    def __init__(self, service: Service, task: Task, settings: RobotBridgeSettings, totals: Totals) -> None:
+    def __init__(
+        self,
+        service: Service,
+        task: Task,
+        settings: RobotBridgeSettings,
+        totals: Totals,
+        latched: str | None = None,
+    ) -> None:
         self._service, self._task, self._settings = service, task, settings
         self._clock, self._spec = service.clock, task.spec
         self._realtime = settings.pacing == "realtime"
         self._cycle_ns = round(self._spec.action_cycle_time_s * 1e9)
         self._keeper = CycleKeeper(self._cycle_ns)
         self._watchdog = Watchdog(round(settings.stop_after * 1e9))
+        self._watchdog.latched = latched
         self._ledger = Ledger(self._spec, totals)
         self.counts = CycleCounts()
-        self._time_steps = TimeStepStream(service, settings, self.counts)
+        self._time_steps = TimeStepStream(service, self._spec, settings, self.counts)
         self._answers = Answers(service, self._spec, self.counts)
         self._finished_publisher = service.transport.publisher(topics.FINISHED)
         self._last_return: float | None = None
         self._engaged = False
+        self._probing = False
+        """True while an observation is out only to see whether it is answered."""
         self._needs_new_goal = True
         self._attempt_first_seq = 0
         self._in_force = self._no_command()
@@ -78,7 +88,9 @@ class RobotBridge:
         self._service.state = "running"
         try:
             self._run_attempts()
-            self._finish("stopped" if self._service.stopping.is_set() else "steps")
+            if self._service.failure is None:
+                # A bridge that a newer one has replaced must not end the newer one's run.
+                self._finish("stopped" if self._service.stopping.is_set() else "steps")
         finally:
             self._time_steps.journal.stop()
 
@@ -106,11 +118,16 @@ class RobotBridge:
             self._reset()
 
     def _begin_attempt(self) -> None:
+        self._advance_world()
         if self._needs_new_goal:
             self._task.begin_episode()
             self._needs_new_goal = False
         else:
             self._task.begin_attempt()
+        self._publish_first()
+
+    def _publish_first(self) -> None:
+        """Publish the first TimeStep of an attempt."""
         self._ledger.begin_attempt()
         self._attempt_first_seq = self.counts.produced
         self._in_force = self._no_command()
@@ -129,7 +146,7 @@ class RobotBridge:
         if answered:
             self._in_force = replace(self._in_force, source=ActionSource.HELD)
         elif self._settings.on_missing_action == "zero" and self._in_force.source is ActionSource.HELD:
-            self._command(np.zeros_like(self._in_force.action), ActionSource.ZERO, self._in_force.answered_seq)
+            self._command(self._no_command().action, ActionSource.ZERO, self._in_force.answered_seq)
         if episode:
             self._record_episode(episode)
         self._needs_new_goal = outcome.terminated or episode is not None
@@ -246,6 +263,8 @@ class RobotBridge:
 
     def _apply(self, arrived: Arrived[Action]) -> None:
         self._engaged = True
+        if self._probing:
+            return
         clipped = np.clip(arrived.message.action, self._spec.action_low, self._spec.action_high)
         self._command(clipped, ActionSource.POLICY, arrived.message.answered_seq)
 
@@ -262,6 +281,7 @@ class RobotBridge:
 
     def _no_command(self) -> CommandInForce:
         zeros = np.zeros(len(self._spec.action_low), np.float32)
+        zeros = np.clip(zeros, self._spec.action_low, self._spec.action_high)
         return CommandInForce(zeros, ActionSource.ZERO, -1, self._clock.now_ns())
 
     # ------------------------------------------------------------------ observations
@@ -297,15 +317,17 @@ class RobotBridge:
             self._service.stopping.wait(0.05)
             return
         logger.info("actor and replay are there: asking for a first answer")
-        # The probe is an attempt of a single TimeStep: no transition comes of it, and no step is counted.
-        self._begin_attempt()
+        # An attempt of a single TimeStep, of which no transition comes: no step is counted and the robot stands still.
+        self._probing = True
+        self._advance_world()
+        self._publish_first()
         asked_ns = self._clock.now_ns()
         while not self._engaged and self._clock.now_ns() - asked_ns < self._settings.stop_after * 1e9:
             if self._service.stopping.is_set():
                 return
             self._sleep_until(asked_ns + round(self._settings.stop_after * 1e9))
             self._take_actions()
-        self._task.stop()
+        self._probing = False
         self._keeper.start(self._clock.now_ns())
 
     def _tell_waiting(self, waiting: list[str]) -> None:
@@ -317,7 +339,8 @@ class RobotBridge:
     def _finish(self, reason: str) -> None:
         finished = encode(Finished(self._service.incarnation, self.counts.produced, reason))
         sent_ns = 0
-        logger.info("finished (%s): %d steps, %d episodes", reason, *list(asdict(self._ledger.totals).values())[::2])
+        totals = self._ledger.totals
+        logger.info("finished (%s): %d steps, %d episodes", reason, totals.steps, totals.episodes)
 
         def work() -> None:
             nonlocal sent_ns
@@ -348,6 +371,7 @@ class RobotBridge:
 
     def _latch(self, reason: str) -> str:
         self._watchdog.latch(reason)
+        self._service.write_record()  # at once: a restarted bridge must know of an emergency stop
         with self._service.wake:
             self._service.wake.notify_all()
         return f"{reason}: the robot stops; `resume` lets it go on"
@@ -377,4 +401,5 @@ class RobotBridge:
             "has_goal": self._spec.has_goal,
             "seed": self._service.run.seed,
             "steps_total": self._settings.steps,
+            "latched": self._watchdog.latched,
         }

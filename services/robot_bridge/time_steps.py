@@ -10,7 +10,7 @@ from common import topics
 from common.codec import encode
 from common.errors import ServiceError
 from common.journal import JournalSender
-from common.messages import ActionSource, Float32Array, TimeStep
+from common.messages import ActionSource, Float32Array, TaskSpec, TimeStep
 from common.service import Service
 from services.robot_bridge.bookkeeping import CycleCounts, Ledger
 from services.robot_bridge.config import RobotBridgeSettings
@@ -30,8 +30,8 @@ class CommandInForce:
 class TimeStepStream:
     """Builds, numbers and publishes the TimeSteps of this incarnation."""
 
-    def __init__(self, service: Service, settings: RobotBridgeSettings, counts: CycleCounts) -> None:
-        self._service, self._counts = service, counts
+    def __init__(self, service: Service, spec: TaskSpec, settings: RobotBridgeSettings, counts: CycleCounts) -> None:
+        self._service, self._counts, self._dimensions = service, counts, spec.dimensions
         self._payload = b""
         self.journal = JournalSender(
             service.transport,
@@ -57,10 +57,11 @@ class TimeStepStream:
         """Publish what the sensors show now and what led to it.
 
         Raises:
-            ServiceError: a sensor or the reward is not finite; nothing was published.
+            ServiceError: a sensor or the reward is not finite or not of the TaskSpec's shape; nothing was published.
         """
         if not (np.isfinite(reading.proprioception).all() and np.isfinite(reward)):
             raise ServiceError(f"a sensor gave {reading.proprioception}, reward {reward}: expected finite numbers")
+        self._check_shapes(reading)
         first = ledger.step_index == 0
         by_actor = command.source in (ActionSource.POLICY, ActionSource.HELD) and not first
         time_step = TimeStep(
@@ -88,6 +89,18 @@ class TimeStepStream:
         self._counts.produced += 1
         self.journal.put(time_step.seq, self._payload)
         return time_step
+
+    def _check_shapes(self, reading: SensorReading) -> None:
+        # Receivers refuse what does not fit the TaskSpec, every time it is resent: better to say so here.
+        size = self._dimensions
+        wanted = {
+            "frames": ("uint8", (len(reading.frame_ids), size.H, size.W, size.C)),
+            "proprioception": ("float32", (size.P,)),
+        }
+        for name, expected in wanted.items():
+            value = getattr(reading, name)
+            if (value.dtype.name, value.shape) != expected:
+                raise ServiceError(f"a sensor gave {name} of {value.dtype.name} {value.shape}: expected {expected}")
 
     def republish(self) -> None:
         """Publish the newest TimeStep once more."""

@@ -1,7 +1,7 @@
 """Noise frames of a real camera's size: a load for links and buffers, and a check of what arrives.
 
 Noise cannot be compressed, and each frame carries its id, so that whoever receives it can tell which one it is.
-There is no goal, and nothing to learn.
+There is nothing to learn.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ class NoiseFramesSettings:
     """New frames an action cycle brings on average; 1.2 is a 30 Hz camera at 25 cycles a second."""
     time_limit: int = setting(100, low=1)
     reset_steps: int = setting(5, low=0)
+    goal_probability: float = setting(0.0, low=0.0, high=1.0)
+    """Chance of each cycle to end the episode, so that terminal rows can be tested; 0: there is no goal."""
     action_cycle_time: float = setting(0.04, low=0.001, high=10.0)
 
 
@@ -62,7 +64,7 @@ class NoiseFrames(Task):
             world_seconds_per_cycle=settings.action_cycle_time,
             time_limit_steps=settings.time_limit,
             reset_steps=settings.reset_steps,
-            has_goal=False,
+            has_goal=settings.goal_probability > 0,
         )
 
     def begin_episode(self) -> None:
@@ -97,7 +99,8 @@ class NoiseFrames(Task):
         )
 
     def outcome(self) -> Outcome:
-        return Outcome(reward=-1.0, terminated=False)
+        probability = self._settings.goal_probability
+        return Outcome(reward=-1.0, terminated=probability > 0 and bool(self._rng.random() < probability))
 
     def _draw(self, frame_id: int) -> UInt8Array:
         frame = self._rng.integers(0, 256, self._shape, np.uint8)
