@@ -1,35 +1,26 @@
-"""What every service has around its own loop: arguments, logging, signals, heartbeat, record, a clean end."""
+"""What every service has around its own loop: identity, peers, heartbeat, record, a clean end."""
 
 from __future__ import annotations
 
-import argparse
-import gc
 import logging
-import logging.handlers
 import math
-import os
-import queue
-import signal
-import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any
 
 from common import topics
 from common.clock import Clock, SystemClock
 from common.codec import decode, encode
-from common.config import load_config
-from common.errors import MessageError, RelodError, ServiceError
+from common.errors import MessageError, ServiceError
 from common.inbox import Inbox, Refusals
 from common.messages import Command, CommandReply, Finished, Status, TaskSpec
 from common.record import RunRecord
 from common.run_settings import RunSettings
-from common.transport import Transport, ZenohTransport
+from common.transport import Transport
 
-Config = TypeVar("Config")
 logger = logging.getLogger(__name__)
 
 HEARTBEAT_S = 0.2
@@ -301,103 +292,3 @@ class Service:
         )
         step = int(counters.get("steps", counters.get("updates", counters.get("rows", 0))))
         self.record.metrics(step, wall_s, counters)
-
-
-def run_service(
-    name: str,
-    config_class: type[Config],
-    serve: Callable[[Service, Config], None],
-    arguments: Sequence[str] | None = None,
-    description: str | None = None,
-) -> int:
-    """Run one service from its command line until it has ended; return the process's exit code."""
-    parser = argparse.ArgumentParser(
-        prog=f"python -m services.{name}",
-        description=description,
-        epilog="`python -m deploy.launch MODE --task TASK --write-config DIR` writes a configuration for each service.",
-    )
-    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="this service's TOML file")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="SECTION.KEY=VALUE",
-        help="override a setting; may be given several times",
-    )
-    options = parser.parse_args(arguments)
-    try:
-        config: Any = load_config(config_class, options.config, options.set)
-        listener = _start_logging(Path(config.run.directory), name)
-    except RelodError as error:
-        print(f"{name}: error: {error}", file=sys.stderr)
-        return 1
-    try:
-        return _run(name, config, serve)
-    except RelodError as error:
-        logger.error("%s", error)
-        return 1
-    finally:
-        listener.stop()
-        logging.shutdown()
-
-
-def end_process(exit_code: int) -> NoReturn:
-    """End at once: torch takes seconds to be torn down, and a session in a dead network for ever."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(exit_code)
-
-
-def _run(name: str, config: Any, serve: Callable[[Service, Any], None]) -> int:
-    # The interpreter's default of 5 ms is how long a computing thread may keep a waiting real-time thread out.
-    sys.setswitchinterval(5e-4)
-    service = Service(name, config.run, ZenohTransport(config.run, config.transport))
-    _stop_on_signals(service)
-    logger.info("%s starts: run %s, process %d", name, config.run.id, os.getpid())
-    try:
-        service.start()
-        gc.freeze()
-        serve(service, config)
-    except RelodError as error:
-        service.failure = str(error)
-        raise
-    except Exception as error:
-        service.failure = f"{type(error).__name__}: {error}"
-        logger.exception("unexpected error")
-        raise ServiceError(f"unexpected {type(error).__name__}: {error}; see the log") from error
-    finally:
-        service.close()
-        logger.info("%s has ended", name)
-    if service.failure:
-        raise ServiceError(service.failure)
-    return 0
-
-
-def _stop_on_signals(service: Service) -> None:
-    # A handler interrupts the main thread, which may hold the very lock that stopping takes: a thread can wait for it.
-    def handle(number: int, _: object) -> None:
-        threading.Thread(target=service.stop, args=(signal.Signals(number).name,), daemon=True).start()
-
-    # A service started in the background by a script inherits ignored signals: install handlers explicitly.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, handle)
-
-
-def _start_logging(directory: Path, name: str) -> logging.handlers.QueueListener:
-    """Log to ``RUN_DIR/logs/NAME.log`` and to the terminal, from a thread of its own."""
-    try:
-        (directory / "logs").mkdir(parents=True, exist_ok=True)
-        file = logging.FileHandler(directory / "logs" / f"{name}.log", encoding="utf-8")
-    except OSError as error:
-        raise ServiceError(f"{directory}: the run's folder cannot be written: {error.strerror}") from error
-    formatter = logging.Formatter(f"%(asctime)s.%(msecs)03d {name} %(levelname)s %(message)s", "%H:%M:%S")
-    terminal = logging.StreamHandler()
-    for handler in (file, terminal):
-        handler.setFormatter(formatter)
-    entries: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
-    listener = logging.handlers.QueueListener(entries, file, terminal)
-    listener.start()
-    root = logging.getLogger()
-    root.handlers = [logging.handlers.QueueHandler(entries)]
-    root.setLevel(logging.INFO)
-    return listener

@@ -137,6 +137,7 @@ def plan_run(
     }
     _check_task(configurations[ROBOT_BRIDGE])
     _check_access(request.placement, configurations)
+    _check_shared_memory(request.placement, configurations)
     return configurations
 
 
@@ -250,6 +251,14 @@ def _check_access(placement: Placement, configurations: Mapping[str, Any]) -> No
         raise ConfigError(
             f"replay.access = 'map': replay runs on {placement.host[REPLAY]!r} and the learner on "
             f"{placement.host[LEARNER]!r}, and a file can be mapped on one host only; expected 'arrays'"
+        )
+
+
+def _check_shared_memory(placement: Placement, configurations: Mapping[str, Any]) -> None:
+    if placement.spans_hosts and any(c.transport.shared_memory for c in configurations.values()):
+        raise ConfigError(
+            "transport.shared_memory = true: expected false where the services are on two hosts; the emulated hosts "
+            "share their memory, and messages would not cross the network"
         )
 
 

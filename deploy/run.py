@@ -15,6 +15,7 @@ import tomli_w
 
 from common.config import to_tables
 from common.errors import ConfigError
+from common.service import DRAIN_TIMEOUT_S
 from common.topics import LEARNER, ROBOT_BRIDGE, SERVICES
 from deploy.child import LaunchedService
 from deploy.console import Console
@@ -32,6 +33,8 @@ from deploy.supervise import Supervisor
 
 _POLL_S = 0.05
 _PROGRESS_S = 1.0
+_OVERTIME_S = DRAIN_TIMEOUT_S + 10.0
+"""Longest time that the others may need after the bridge has ended; then the network has kept its word from them."""
 _CURVE_UNTIL_S = 4.0
 """After Ctrl-C: from here on there is no time left to wait for the drawing library."""
 
@@ -154,6 +157,9 @@ def _watch(
             if time.monotonic() >= next_progress_s:
                 next_progress_s = time.monotonic() + _PROGRESS_S
                 console.status(progress_line(reader.read()))
+            if supervisor.overdue(_OVERTIME_S):
+                console.error(f"the bridge ended {_OVERTIME_S:.0f} s ago, and some have not heard of it")
+                break
             time.sleep(_POLL_S)
         if not stop.asked:
             supervisor.check()

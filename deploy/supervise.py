@@ -8,12 +8,15 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from common.record import read_parts
 from common.topics import LEARNER, ROBOT_BRIDGE
 from deploy.child import Child, LaunchedService, exit_text
 from deploy.run_file import REPOSITORY
 
 _LOOK_FOR_RETURN_S = 0.5
 _POLL_S = 0.02
+_EARLY_END_S = 3.0
+"""At the end of a run the others may leave before the bridge; after this its part says whether it is the end."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +50,14 @@ class Supervisor:
         self.children = {service.name: Child(service, run_dir) for service in services}
         self.cannot_start = False
         """A service failed before the run had begun: waiting for it makes no sense."""
+        self._run_dir = run_dir
         self._report = report
         self._run_has_begun = run_has_begun
         self._stop_times = stop_times
         self._next_look_s = 0.0
+        self._bridge_ended_s = 0.0
         self._seen_end: set[str] = set()
+        self._left_early: dict[str, float] = {}
         self._seen_end_by_hand: set[int] = set()
 
     def start(self, asked_to_stop: Callable[[], bool] = lambda: False) -> None:
@@ -66,6 +72,14 @@ class Supervisor:
         """True while any service runs, whoever has started it."""
         return any(child.alive for child in self.children.values())
 
+    def overdue(self, limit_s: float) -> bool:
+        """True if the bridge ended well more than ``limit_s`` ago and somebody still runs."""
+        bridge = self.children.get(ROBOT_BRIDGE)
+        if bridge is None or not bridge.ended_well:
+            return False
+        self._bridge_ended_s = self._bridge_ended_s or time.monotonic()
+        return time.monotonic() - self._bridge_ended_s > limit_s
+
     @property
     def failed(self) -> list[str]:
         """Services that died and never returned, or whose last incarnation failed."""
@@ -79,6 +93,9 @@ class Supervisor:
                 self._seen_end.add(child.name)
                 self._note_end(child, code)
         now_s = time.monotonic()
+        for name in [name for name, due_s in self._left_early.items() if now_s >= due_s]:
+            del self._left_early[name]
+            self._note_early_end(self.children[name])
         if now_s >= self._next_look_s:
             self._next_look_s = now_s + _LOOK_FOR_RETURN_S
             for child in self.children.values():
@@ -117,6 +134,8 @@ class Supervisor:
 
     def _note_end(self, child: Child, code: int) -> None:
         if code == 0:
+            if child.name != ROBOT_BRIDGE:
+                self._left_early[child.name] = time.monotonic() + _EARLY_END_S
             return
         child.died = True
         lines = [f"{child.name} has died: {exit_text(code)}"]
@@ -126,8 +145,17 @@ class Supervisor:
             self.cannot_start = True
             lines += ["  it could not start, so the run ends"]
         else:
-            lines += [f"  the others go on; start it again, in {REPOSITORY}:", f"  {child.service.command_line()}"]
+            lines += _how_to_return(child)
         self._report("\n".join(lines))
+
+    def _note_early_end(self, child: Child) -> None:
+        """Somebody has asked a service to stop, which then ends with code 0, and the run goes on without it."""
+        bridge = self.children.get(ROBOT_BRIDGE)
+        parts = read_parts(self._run_dir, ROBOT_BRIDGE)
+        if bridge is None or not bridge.alive or not parts or parts[-1].get("state") != "running":
+            return
+        child.died = True
+        self._report("\n".join([f"{child.name} has ended before the run is over", *_how_to_return(child)]))
 
     def _look_for_return(self, child: Child) -> None:
         if child.newer_incarnation():
@@ -140,3 +168,7 @@ class Supervisor:
         if not child.ended_well:
             reason = part.get("failure") or "killed"
             self._report(f"{child.name} has died again: {reason}\n  {child.service.command_line()}")
+
+
+def _how_to_return(child: Child) -> list[str]:
+    return [f"  the others go on; start it again, in {REPOSITORY}:", f"  {child.service.command_line()}"]

@@ -10,7 +10,8 @@ from common import topics
 from common.algorithms.presets import resolve_config
 from common.policies import initial_policy
 from common.priority import ACTOR_PRIORITY, run_before_others
-from common.service import Service, end_process, run_service
+from common.run_service import end_process, run_service
+from common.service import Service
 from services.actor.actor import Actor
 from services.actor.config import ActorConfig
 

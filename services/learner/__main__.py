@@ -7,7 +7,8 @@ import os
 from pathlib import Path
 
 from common import topics
-from common.service import Service, end_process, run_service
+from common.run_service import end_process, run_service
+from common.service import Service
 from services.learner.config import LearnerConfig
 
 logger = logging.getLogger(__name__)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from common import topics
 from common.algorithms.presets import resolve_config
-from common.service import Service, end_process, run_service
+from common.run_service import end_process, run_service
+from common.service import Service
 from services.replay.config import ReplayConfig
 from services.replay.replay import Replay
 

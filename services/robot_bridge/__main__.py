@@ -10,7 +10,8 @@ import numpy as np
 from common import topics
 from common.priority import BRIDGE_PRIORITY, run_before_others
 from common.record import read_parts
-from common.service import Service, end_process, run_service
+from common.run_service import end_process, run_service
+from common.service import Service
 from services.robot_bridge.bookkeeping import Totals
 from services.robot_bridge.bridge import RobotBridge
 from services.robot_bridge.config import RobotBridgeConfig

@@ -25,6 +25,7 @@ from common.codec import decode, encode
 from common.errors import MessageError, ServiceError
 from common.messages import SCHEMA_VERSION, Command, CommandReply, Finished, Status, TaskSpec
 from common.record import read_parts
+from common.run_service import run_service
 from common.run_settings import RunSettings, TransportSettings
 from common.service import (
     DRAIN_TIMEOUT_S,
@@ -34,7 +35,6 @@ from common.service import (
     RECORD_S,
     STOP_TIMEOUT_S,
     Service,
-    run_service,
 )
 from common.transport import InMemoryNetwork
 from tests.helpers import TIMEOUT_S, eventually, free_port, make_run, make_spec
@@ -694,7 +694,7 @@ import sys
 from dataclasses import dataclass
 from common.errors import ServiceError
 from common.run_settings import RunSettings, TransportSettings
-from common.service import run_service
+from common.run_service import run_service
 
 @dataclass(frozen=True)
 class TinyConfig:

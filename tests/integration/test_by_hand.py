@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from common.frame_ring import RING_FILE, RingReader
+from common.frame_ring.layout import SOURCES
+from common.messages import ActionSource
 from services.robot_bridge.tasks.noise_frames import read_frame_id
 from tests.integration.ring_processes import SMALL_AND_FAST, RingProcesses, options, start_all
 
@@ -23,7 +25,7 @@ STEPS = 700
 @pytest.mark.parametrize("order", ORDERS, ids="-".join)
 def test_any_start_order_learns_and_loses_nothing(order: tuple[str, ...], tmp_path: Path) -> None:
     # One camera frame in some cycles, two or none in others.
-    settings = options(*SMALL_AND_FAST, "task.frames_per_cycle=0.9")
+    settings = options(*SMALL_AND_FAST, "task.frames_per_cycle=0.9", "task.goal_probability=0.02")
     with RingProcesses(tmp_path, "noise_frames", "--steps", str(STEPS), *settings) as ring:
         start_all(ring, order)
         codes = ring.wait()
@@ -53,7 +55,10 @@ def assert_stacks_hold_the_frames_that_their_ids_name(path: Path) -> None:
     second, before = ring.read_rows(pairs), ring.read_rows(pairs - 1)
     assert (second["step_index"] == before["step_index"] + 1).all()
     assert (second["attempt"] == before["attempt"]).all()
-    # Every TimeStep but an attempt's first ends a transition, time-outs included.
-    assert len(pairs) == (records["step_index"][1:] > 0).sum()
-    assert records["truncated"].any()
+    # Every TimeStep but an attempt's first, and what the watchdog brought about, ends a transition.
+    acted = (records["step_index"][1:] > 0) & (records["action_source"][1:] != SOURCES.index(ActionSource.STOP))
+    assert len(pairs) == acted.sum()
+    # Goals and time-outs are transitions like the others, with the frames that came last.
+    assert second["terminated"].sum() == records["terminated"][1:].sum() > 0
+    assert second["truncated"].sum() == records["truncated"][1:].sum() > 0
     ring.close()

@@ -54,9 +54,11 @@ def test_outages_of_a_limited_link_lose_nothing(mode: str, tmp_path: Path) -> No
     assert (experience["lost"], experience["duplicated"]) == (0, 0)
     assert summary["network_link"]["backend"] in ("namespaces", "relay")
     if mode == "remote_only":
-        assert summary["outages"], "at least one outage should have ended during the run"
-        # The goal is 1.5 s; the slack is for a busy machine.
-        assert all(outage["first_action_s"] <= 3.0 for outage in summary["outages"])
+        # None: the run ended before an answer could come. The goal is 1.5 s; the slack is for a busy machine.
+        first_actions = [outage["first_action_s"] for outage in summary["outages"]]
+        answered = [seconds for seconds in first_actions if seconds is not None]
+        assert answered, "at least one outage should have ended well before the run"
+        assert max(answered) <= 3.0
 
 
 @pytest.mark.parametrize("mode", ["remote_local", "remote_only"])
@@ -84,7 +86,6 @@ def test_ctrl_c_ends_everything_and_completes_the_record(when: str, tmp_path: Pa
             wait_until(lambda: read_parts(run_dir, "robot_bridge"), "the bridge has started")
         if when == "while acting":
             wait_until(lambda: read_parts(run_dir, "robot_bridge")[-1]["counters"]["steps"] > 50, "steps are done")
-        pids = [part["pid"] for part in read_parts(run_dir)]
         pressed = time.monotonic()
         process.send_signal(signal.SIGINT)
         output, _ = process.communicate(timeout=60)
@@ -93,7 +94,7 @@ def test_ctrl_c_ends_everything_and_completes_the_record(when: str, tmp_path: Pa
     assert process.returncode in ((130, -signal.SIGINT) if when == "at once" else (130,)), output
     # The goal is 5 s; the slack is for a busy machine.
     assert took_s < 10, output
-    assert not [pid for pid in pids if is_running(pid)]
+    assert processes_of(run_dir) == []
     if when != "at once":
         summary = json.loads((run_dir / "summary.json").read_text())
         experience = summary["experience"]
@@ -120,9 +121,49 @@ def test_a_dead_service_is_reported_at_once_and_the_exit_code_tells(tmp_path: Pa
     assert summary["experience"]["lost"] == 0
 
 
-def is_running(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
+def test_commands_reach_the_services_and_an_early_end_is_reported(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    arguments = ("local_only", "--task", "noise_frames", "--steps", "900")
+    with launch(run_dir, *arguments, *options(*SMALL_AND_FAST)) as process:
+        wait_until(lambda: steps(run_dir) > 0, "the robot acts")
+        assert command(run_dir, "robot_bridge", "e_stop").returncode == 0
+        wait_until(lambda: read_parts(run_dir, "robot_bridge")[-1]["latched"] == "e_stop", "the stop is recorded")
+        refused = command(run_dir, "actor", "e_stop")
+        assert (refused.returncode, "expected one of" in refused.stderr) == (1, True)
+        assert command(run_dir, "robot_bridge", "resume").returncode == 0
+        before = steps(run_dir)
+        wait_until(lambda: steps(run_dir) > before + 50, "the robot acts again")
+        assert command(run_dir, "learner", "stop").returncode == 0
+        output, _ = process.communicate(timeout=120)
+    assert process.returncode == 1, output
+    assert "learner has ended before the run is over" in output
+    summary = json.loads((run_dir / "summary.json").read_text())
+    assert (summary["steps"], summary["experience"]["lost"]) == (900, 0)
+
+
+def command(run_dir: Path, service: str, name: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "deploy.command", str(run_dir / "config" / f"{service}.toml"), name],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def steps(run_dir: Path) -> float:
+    parts = read_parts(run_dir, "robot_bridge")
+    return float(parts[-1]["counters"].get("steps", 0)) if parts else 0.0
+
+
+def processes_of(run_dir: Path) -> list[str]:
+    """Command lines of running processes that name the run's folder."""
+    lines = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            line = path.read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        except OSError:
+            continue  # it has just ended
+        if str(run_dir) in line:
+            lines.append(line)
+    return lines
