@@ -352,12 +352,16 @@ class Status:
     """``robot_bridge``, ``actor``, ``replay`` or ``learner``."""
     run: str
     """Run id, so that a peer of another run on the same mesh is noticed."""
+    robot: str
+    """Robot the service works for; several may share a run."""
     incarnation: Count
     """Start of the process, nanoseconds since 1970."""
     state: str
     """``starting``, ``running``, ``draining``, ``drained`` or ``stopped``."""
     counters: dict[str, float]
     """The service's own counts and gauges."""
+    peers: dict[str, int]
+    """Service -> newest incarnation the sender has heard of: an older one learns that it has been replaced."""
 
 
 @dataclass(frozen=True)

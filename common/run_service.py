@@ -11,6 +11,7 @@ import queue
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -25,6 +26,9 @@ from common.transport import ZenohTransport
 
 Config = TypeVar("Config")
 logger = logging.getLogger(__name__)
+
+_STARTING_S = 1.0
+"""A service that is asked to stop while it starts has this long to notice by itself."""
 
 
 def run_service(
@@ -79,6 +83,14 @@ def _run(name: str, config: Any, serve: Callable[[Service, Any], None]) -> int:
     _stop_on_signals(service)
     _keep_configuration(name, config)
     logger.info("%s starts: run %s, process %d", name, config.run.id, os.getpid())
+    endpoints = config.transport
+    dialled = [*endpoints.connect_real_time, *endpoints.connect_bulk]
+    logger.info(
+        "listens on %s and %s, connects to %s",
+        endpoints.listen_real_time,
+        endpoints.listen_bulk,
+        ", ".join(dialled) or "nobody",
+    )
     try:
         service.start()
         gc.freeze()
@@ -110,10 +122,18 @@ def _keep_configuration(name: str, config: Any) -> None:
 def _stop_on_signals(service: Service) -> None:
     # A handler interrupts the main thread, which may hold the very lock that stopping takes: a thread can wait for it.
     def handle(number: int, _: object) -> None:
-        threading.Thread(target=service.stop, args=(signal.Signals(number).name,), daemon=True).start()
+        threading.Thread(target=stop, args=(signal.Signals(number).name,), daemon=True).start()
+
+    def stop(reason: str) -> None:
+        service.stop(reason)
+        time.sleep(_STARTING_S)
+        if service.state == "starting":
+            # It is still importing, for seconds more; there is nothing to hand over yet.
+            service.close()
+            end_process(0)
 
     # A service started in the background by a script inherits ignored signals: install handlers explicitly.
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, handle)
 
 

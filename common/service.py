@@ -237,8 +237,9 @@ class Service:
         for status, at_ns in self._status_inbox.take():
             self._hear(status, at_ns)
         if self._finished_inbox and (finished := self._finished_inbox.take_newest()):
-            newest = self._finished is None or finished.message.incarnation >= self._finished.incarnation
-            if newest:
+            bridge = self._peers.get(topics.ROBOT_BRIDGE)
+            # Of the bridge that is running, and no other's: it is sent again until all have heard it.
+            if bridge is not None and bridge.status.incarnation == finished.message.incarnation:
                 self._finished = finished.message
                 with self.wake:
                     self.wake.notify_all()
@@ -254,10 +255,16 @@ class Service:
                     self.run.id,
                 )
             return
+        if status.robot != self.run.robot:
+            return
+        # Two of a kind need not be connected to each other: the others tell.
+        newest = status.peers.get(self.name, 0)
+        if status.service == self.name and status.state != "stopped":
+            newest = max(newest, status.incarnation)
+        if newest > self.incarnation and self.failure is None:
+            self.failure = f"a newer {self.name} has joined this run; two cannot serve one robot"
+            self.stop(self.failure)
         if status.service == self.name:
-            if status.incarnation > self.incarnation and status.state != "stopped":
-                self.failure = f"a newer {self.name} has joined this run; two cannot serve one robot"
-                self.stop(self.failure)
             return
         known = self._peers.get(status.service)
         if known and status.incarnation < known.status.incarnation:
@@ -269,7 +276,8 @@ class Service:
     def _send_status(self) -> None:
         # A loss that is no number any more must not make the whole service look gone.
         counters = {name: float(value) for name, value in self.counters().items() if math.isfinite(value)}
-        status = Status(self.name, self.run.id, self.incarnation, self.state, counters)
+        peers = {name: peer.status.incarnation for name, peer in list(self._peers.items())}
+        status = Status(self.name, self.run.id, self.run.robot, self.incarnation, self.state, counters, peers)
         self._status_publisher.put(encode(status))
 
     def write_record(self) -> None:

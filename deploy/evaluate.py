@@ -18,7 +18,7 @@ import numpy as np
 
 from common.codec import decode
 from common.config import load_config
-from common.errors import ConfigError, RelodError
+from common.errors import ConfigError, MessageError, RelodError
 from common.frame_stack import FrameStack
 from common.messages import Float32Array, PolicyWeights, UInt8Array
 from common.policies import Observation, Policy, policy_from_weights
@@ -163,6 +163,8 @@ def load_run(run_dir: Path, config_path: Path | None, seed: int) -> tuple[Evalua
         weights = decode(policy_path.read_bytes(), PolicyWeights)
     except FileNotFoundError:
         raise ConfigError(f"{policy_path} is missing: the learner has not saved a policy") from None
+    except MessageError as error:
+        raise ConfigError(f"{policy_path} cannot be used: {error}") from error
     return Evaluation(task, policy_from_weights(task.spec, weights), rng, seed), task, weights
 
 

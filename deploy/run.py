@@ -59,7 +59,8 @@ class Drawing:
 
     def _load(self) -> None:
         # The run comes first.
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+        thread = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, thread, max(10, os.getpriority(os.PRIO_PROCESS, thread)))
         load_drawing()
 
 
@@ -153,7 +154,8 @@ def _watch(
         while supervisor.running and not stop.asked and not supervisor.cannot_start:
             supervisor.check()
             if network_failure is None and (network_failure := network_link.failure()):
-                console.error(f"the emulated network has failed, nothing crosses it any more: {network_failure}")
+                console.error(f"the emulated network has failed, and so the run ends: {network_failure}")
+                break
             if time.monotonic() >= next_progress_s:
                 next_progress_s = time.monotonic() + _PROGRESS_S
                 console.status(progress_line(reader.read()))
@@ -181,8 +183,8 @@ def _summarise(run_dir: Path, drawing: Drawing, stop: StopSignals, console: Cons
         summary = summarise(read_record(run_dir))
         for warning in summary.warnings:
             console.error(f"deploy.launch: warning: {warning}")
-        paths = [write_summary(run_dir, summary)]
         console.line(summary_text(summary.values))
+        paths = [write_summary(run_dir, summary)]
         if drawing.is_loaded(stop):
             paths.append(write_curve(run_dir, summary))
         else:

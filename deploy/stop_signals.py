@@ -9,11 +9,14 @@ from typing import Any, Self
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
-_NUMBERS = (signal.SIGINT, signal.SIGTERM)
+_NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopSignals:
-    """Notes SIGINT and SIGTERM while entered; the first counts, more change nothing. For the main thread."""
+    """Notes SIGINT, SIGTERM and SIGHUP (a closed terminal) while entered. For the main thread.
+
+    The first counts, more change nothing.
+    """
 
     def __init__(self) -> None:
         self.asked_s: float | None = None

@@ -70,6 +70,8 @@ def read_record(run_dir: Path) -> Record:
     """
     if not run_dir.is_dir():
         raise ConfigError(f"{run_dir}: no such run directory")
+    if not (run_dir / "run.toml").exists() and not (run_dir / "parts").is_dir():
+        raise ConfigError(f"{run_dir}: expected a run's record, with run.toml or parts/; there is neither")
     warnings: list[str] = []
 
     def attempt(read: Callable[[], Any]) -> Any:

@@ -6,6 +6,7 @@ import asyncio
 import math
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 
 from deploy.network.conditions import Direction, NetworkConditions
 from deploy.network.part import DirectionCounts
@@ -137,7 +138,8 @@ class Way:
             sink.write(ready[0] if len(ready) == 1 else b"".join(ready))
         if at_end:
             if not sink.is_closing():
-                sink.write_eof()
+                with suppress(OSError):  # the other side has closed the connection meanwhile
+                    sink.write_eof()
             self._end()
 
     def _end(self) -> None:

@@ -141,7 +141,7 @@ class Actor:
     def _wait_for_updates(self) -> None:
         """In lockstep the world waits until the learner has spent the budget."""
         service = self._service
-        while self._forwarder.updates_owed > self._settings.lockstep_surplus:
+        while self._forwarder.updates_owed_at_most > self._settings.lockstep_surplus:
             if service.stopping.is_set() or service.finished is not None:
                 return
             with service.wake:

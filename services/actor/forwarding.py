@@ -48,6 +48,7 @@ class ExperienceForwarder:
         self._thread = threading.Thread(target=self._run, name="experience", daemon=True)
         self.experiences = 0
         """Experiences sent."""
+        self._earns = False
         self.updates_owed = 0.0
         """Replay's unspent update budget, as of its last acknowledgement."""
 
@@ -76,6 +77,14 @@ class ExperienceForwarder:
             self._answers[time_step.incarnation, time_step.seq] = extras
             if len(self._answers) > REMEMBERED_ANSWERS:
                 self._answers.popitem(last=False)
+
+    @property
+    def updates_owed_at_most(self) -> float:
+        """What replay owed as of its last acknowledgement, or may owe by what has been sent since."""
+        with self._wake:
+            sent_since = len(self._incoming) + self._in_hand + self._sender.unacknowledged
+        # Before the minimum size is reached, nothing is earned by it.
+        return max(self.updates_owed, sent_since if self._earns else 0)
 
     def is_drained(self, incarnation: int, produced: int) -> bool:
         """True if all that the bridge produced has come, gone on to replay, and been acknowledged there."""
@@ -126,6 +135,7 @@ class ExperienceForwarder:
 
     def _note_acknowledgement(self, acknowledgement: Acknowledgement) -> None:
         self.updates_owed = acknowledgement.updates_owed
+        self._earns = self._earns or acknowledgement.updates_owed > 0
         # In lockstep the actor may be waiting for the budget to be spent.
         with self._service.wake:
             self._service.wake.notify_all()

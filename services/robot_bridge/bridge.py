@@ -371,6 +371,7 @@ class RobotBridge:
 
     def _latch(self, reason: str) -> str:
         self._watchdog.latch(reason)
+        logger.warning("%s: the robot stops", reason)
         self._service.write_record()  # at once: a restarted bridge must know of an emergency stop
         with self._service.wake:
             self._service.wake.notify_all()
@@ -378,6 +379,7 @@ class RobotBridge:
 
     def _resume(self) -> str:
         self._watchdog.release(self._clock.now_ns())
+        logger.warning("resumed: the robot may move")
         return "resumed"
 
     def counters(self) -> dict[str, float]:

@@ -332,15 +332,20 @@ def test_a_field_whose_name_is_bytes_is_unknown():
         (make_time_step(), "action_source", ["policy"], "TimeStep.action_source: expected one of"),
         (make_time_step(), "action_source", None, "TimeStep.action_source: expected one of"),
         # tables and lists
-        (Status("actor", "r", 1, "running", {}), "counters", [], "Status.counters: expected dict, got list"),
         (
-            Status("actor", "r", 1, "running", {}),
+            Status("actor", "r", "robot0", 1, "running", {}, {}),
+            "counters",
+            [],
+            "Status.counters: expected dict, got list",
+        ),
+        (
+            Status("actor", "r", "robot0", 1, "running", {}, {}),
             "counters",
             {"steps": "many"},
             r"Status.counters\[steps\]: expected float",
         ),
         (
-            Status("actor", "r", 1, "running", {}),
+            Status("actor", "r", "robot0", 1, "running", {}, {}),
             "counters",
             {"loss": float("nan")},
             r"Status.counters\[loss\]: .*finite",
@@ -461,7 +466,7 @@ def test_an_error_stays_short_however_long_what_came_is():
             decode(changed(Command("stop"), path, long), Command)
         assert len(str(caught.value)) < 1000
     with pytest.raises(MessageError) as caught:
-        decode(changed(Status("actor", "r", 1, "running", {}), "counters", {long: None}), Status)
+        decode(changed(Status("actor", "r", "robot0", 1, "running", {}, {}), "counters", {long: None}), Status)
     assert len(str(caught.value)) < 1000
 
 

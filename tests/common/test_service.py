@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgpack
@@ -106,7 +106,8 @@ def scene(tmp_path):
 
 
 def status(service="actor", incarnation=1, state="running", run="test", **counters):
-    return Status(service, run, incarnation, state, {name: float(value) for name, value in counters.items()})
+    counts = {name: float(value) for name, value in counters.items()}
+    return Status(service, run, "robot0", incarnation, state, counts, {})
 
 
 def heard(service, name="actor"):
@@ -284,21 +285,40 @@ def test_rubbish_on_status_and_finished_is_counted(scene):
 def test_the_bridges_word_that_the_run_is_over_wakes_the_service(scene):
     actor = scene.service("actor")
     assert actor.finished is None
+    scene.say(status("robot_bridge", incarnation=5))
+    heard(actor, "robot_bridge")
     with actor.wake:
         scene.say(Finished(5, 100, "steps"), topics.FINISHED)
         assert actor.wake.wait_for(lambda: actor.finished, TIMEOUT_S)
     assert actor.finished == Finished(5, 100, "steps")
 
 
-def test_a_newer_bridges_word_replaces_an_older_ones(scene):
+def test_only_the_running_bridge_can_say_that_the_run_is_over(scene):
     actor = scene.service("actor")
-    for incarnation, counts in ((5, 5), (7, 7), (6, 7)):
+    scene.say(status("robot_bridge", incarnation=7))
+    heard(actor, "robot_bridge")
+    for incarnation in (1, 6, 8):
         scene.say(Finished(incarnation, 10, "steps"), topics.FINISHED)
         scene.beat()
         scene.beat()  # in the second one at the latest it is taken
-        assert actor.finished.incarnation == counts
+        assert actor.finished is None
     scene.say(Finished(7, 11, "stopped"), topics.FINISHED)
     eventually(lambda: actor.finished == Finished(7, 11, "stopped"))
+
+
+def test_a_service_learns_from_the_others_that_it_has_been_replaced(scene):
+    actor = scene.service("actor")
+    told = status("robot_bridge")
+    scene.say(replace(told, peers={"actor": actor.incarnation, "replay": actor.incarnation + 1}))
+    heard(actor, "robot_bridge")
+    assert not actor.stopping.is_set()
+    scene.say(replace(told, peers={"actor": actor.incarnation + 1}, robot="another"))
+    scene.beat()
+    scene.beat()
+    assert not actor.stopping.is_set()
+    scene.say(replace(told, peers={"actor": actor.incarnation + 1}))
+    eventually(actor.stopping.is_set)
+    assert "a newer actor has joined" in actor.failure
 
 
 def test_the_bridge_does_not_listen_to_itself(scene):
@@ -509,6 +529,9 @@ def test_draining_gives_up_after_its_time(scene, caplog, ask, limit_s):
     if ask == "stop":
         actor.stop("a test")
     elif ask:
+        scene.say(status("robot_bridge", incarnation=1))
+        heard(actor, "robot_bridge")
+        scene.say(status("robot_bridge", incarnation=1, state="stopped"))
         scene.say(Finished(1, 10, ask), topics.FINISHED)
         eventually(lambda: actor.finished)
     began_ns = scene.clock.now_ns()
