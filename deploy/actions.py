@@ -18,7 +18,7 @@ from deploy.network.part import NetworkPart
 
 @dataclass(frozen=True)
 class ArrivedActions:
-    """One row per Action that arrived at the bridge and was not refused."""
+    """One row per TimeStep that was answered, whether its first answer could still be applied or not."""
 
     published_ns: Int64Array
     """(n,) when the TimeStep that the action answers was published."""

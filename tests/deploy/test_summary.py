@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from common.errors import ConfigError
 from common.frame_ring import RingWriter
 from deploy import summary
 from deploy.run_file import RunFile
@@ -192,7 +193,14 @@ def test_a_ring_that_has_wrapped_is_read_whole(tmp_path: Path) -> None:
     assert len(content.published_ns) == 10
 
 
+def test_a_folder_that_is_no_run_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"expected a run's record"):
+        read_record(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_is_missing_is_null_with_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "parts").mkdir()
     result = summarise(read_record(tmp_path))
     assert list(result.values) == FIELDS
     assert result.values["bytes_per_key"] == {}
