@@ -89,7 +89,10 @@ def produced(parts: RunParts) -> int | None:
 def persisted(parts: RunParts) -> int | None:
     """Distinct TimeSteps that replay has stored."""
     counts = newest_detail(parts, REPLAY, "persisted")
-    return None if counts is None else sum(int(count) for count in counts.values())
+    if counts is None:
+        # A run that was stopped before replay had opened its ring: of nothing, nothing was stored.
+        return 0 if produced(parts) == 0 else None
+    return sum(int(count) for count in counts.values())
 
 
 def newest_detail(parts: RunParts, service: str, name: str) -> Any:
