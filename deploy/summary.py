@@ -152,7 +152,8 @@ def summarise(record: Record) -> Summary:
             "produced": produced,
             "persisted": persisted,
             "lost": None if produced is None or persisted is None else produced - persisted,
-            "duplicated": record.ring.duplicated if record.ring else None,
+            # Without a ring, nothing can be in it twice.
+            "duplicated": record.ring.duplicated if record.ring else 0 if persisted == 0 else None,
             "resent": _sum(parts.total(ROBOT_BRIDGE, "resent"), parts.total(ACTOR, "resent")),
         },
         "updates": _count(parts.greatest(LEARNER, "updates")),
