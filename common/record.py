@@ -1,8 +1,8 @@
 """A service's part of the run's record, written by a thread of its own: the disk never delays anyone.
 
 ``RUN_DIR/`` afterwards holds, from this file, ``parts/SERVICE-INCARNATION.json`` (the service's counts, replaced
-about once a second, so a killed service leaves its last ones), ``metrics/SERVICE.csv``, ``tensorboard/SERVICE/`` and
-the tables a service adds rows to.
+about once a second; a killed service leaves its last ones, and those of :mod:`common.surviving_counts`),
+``metrics/SERVICE.csv``, ``tensorboard/SERVICE/`` and the tables a service adds rows to.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
+from common.surviving_counts import settle, with_surviving_counts
+
 logger = logging.getLogger(__name__)
 
 _QUEUE_LENGTH = 20_000
@@ -36,14 +38,29 @@ def write_atomically(path: Path, text: str) -> None:
 
 def read_parts(directory: Path, service: str = "*") -> list[dict[str, Any]]:
     """All readable parts of a run's record, oldest incarnation first."""
-    parts = []
+    parts = _read_parts(directory, service)
+    return [with_surviving_counts(parts[path]) for path in sorted(parts, key=lambda path: parts[path]["incarnation"])]
+
+
+def settle_parts(directory: Path) -> None:
+    """Write what killed services have left in memory into their parts, where a restart of the computer keeps it."""
+    for path, part in _read_parts(directory, "*").items():
+        settle(part, lambda complete, path=path: write_atomically(path, _part_text(complete)))  # type: ignore[misc]
+
+
+def _read_parts(directory: Path, service: str) -> dict[Path, dict[str, Any]]:
+    parts = {}
     for path in directory.glob(f"parts/{service}-*.json"):
         try:
             part = json.loads(path.read_text(encoding="utf-8"))
-            parts.append((int(part["incarnation"]), part))
+            parts[path] = {**part, "incarnation": int(part["incarnation"])}
         except (OSError, ValueError, TypeError, KeyError) as error:
             logger.warning("%s: left out of the record: %r", path, error)
-    return [part for _, part in sorted(parts, key=lambda item: item[0])]
+    return parts
+
+
+def _part_text(part: Mapping[str, Any]) -> str:
+    return json.dumps(part, indent=1)
 
 
 @dataclass
@@ -82,7 +99,7 @@ class RunRecord:
         """Replace this incarnation's part."""
         path = self.directory / "parts" / f"{self._service}-{self._incarnation}.json"
         content = {"service": self._service, "incarnation": self._incarnation, "pid": os.getpid(), **values}
-        self._put(lambda: write_atomically(path, json.dumps(content, indent=1)))
+        self._put(lambda: write_atomically(path, _part_text(content)))
 
     def row(self, table: str, values: Mapping[str, Any]) -> None:
         """Append a row to ``RUN_DIR/<table>.csv``; new columns are added to the table."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import threading
@@ -76,6 +77,8 @@ class Service:
         """The service's counts and gauges: sent with the heartbeat, recorded as metrics."""
         self.details: Callable[[], dict[str, Any]] = dict
         """What else belongs into the service's part of the record."""
+        self.closing = contextlib.ExitStack()
+        """What is released once the last part has been written."""
         self._peers: dict[str, Peer] = {}
         self._foreign: set[str] = set()
         self._finished: Finished | None = None
@@ -123,6 +126,8 @@ class Service:
         self._send_status()
         self.write_record()
         self.record.close()
+        if not self.record.dropped:
+            self.closing.close()
         # Zenoh tries for long to say goodbye over a dead link; nobody is there who could hear it.
         closing = threading.Thread(target=self.transport.close, name="close", daemon=True)
         closing.start()

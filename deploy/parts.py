@@ -49,10 +49,17 @@ class RunParts:
 
     def bytes_sent(self) -> dict[str, Counter[str]]:
         """Service -> topic -> payload bytes sent."""
-        sent: dict[str, Counter[str]] = {service: Counter() for service in SERVICES}
+        return self._bytes("bytes_sent")
+
+    def bytes_received(self) -> dict[str, Counter[str]]:
+        """Service -> topic -> payload bytes that arrived."""
+        return self._bytes("bytes_received")
+
+    def _bytes(self, name: str) -> dict[str, Counter[str]]:
+        counts: dict[str, Counter[str]] = {service: Counter() for service in SERVICES}
         for part in self.parts:
-            sent[part["service"]].update(part.get("bytes_sent", {}))
-        return sent
+            counts[part["service"]].update(part.get(name, {}))
+        return counts
 
     def _values(self, service: str, counter: str) -> list[float]:
         counters = (part.get("counters", {}) for part in self.of(service))
@@ -72,8 +79,8 @@ def elapsed_s(parts: RunParts) -> float | None:
 def produced(parts: RunParts) -> int | None:
     """TimeSteps published, over all incarnations of the bridge.
 
-    The bridge's own count. The last part of one that was killed is up to a second old: what replay knows to have
-    existed is then more.
+    The bridge's own count. Of one that was killed on another computer, only its last part is here, up to a second
+    old: what replay knows to have existed is then more.
     """
     counts: Counter[str] = Counter()
     for part in parts.of(ROBOT_BRIDGE):

@@ -15,7 +15,7 @@ from typing import Any
 
 from common.errors import ConfigError, RelodError, RingError
 from common.messages import Int64Array
-from common.record import write_atomically
+from common.record import settle_parts, write_atomically
 from common.topics import ACTOR, LEARNER, ROBOT_BRIDGE
 from deploy import parts as run_parts
 from deploy.actions import ArrivedActions, last_published_ns, outage_ends
@@ -63,7 +63,7 @@ class Summary:
 
 
 def read_record(run_dir: Path) -> Record:
-    """Read a run's record.
+    """Read a run's record; what killed services have left in memory is written into it first.
 
     Raises:
         ConfigError: there is no such folder.
@@ -82,6 +82,7 @@ def read_record(run_dir: Path) -> Record:
             return None
 
     table = EpisodeTable(run_dir)
+    attempt(lambda: settle_parts(run_dir))
     attempt(table.update)
     actions = attempt(lambda: ArrivedActions.read(run_dir))
     unreadable = table.unreadable + (actions.unreadable if actions else 0)
@@ -213,7 +214,8 @@ def _outages(record: Record, notes: list[str]) -> list[dict[str, float | None]] 
 def _network_link(record: Record) -> dict[str, Any] | None:
     if record.network is None or record.run is None:
         return None
-    return network_link(record.run.backend, record.network, record.parts.bytes_sent(), record.run.placement)
+    parts, run = record.parts, record.run
+    return network_link(run.backend, record.network, parts.bytes_sent(), parts.bytes_received(), run.placement)
 
 
 def _read_network(run_dir: Path) -> NetworkPart | None:

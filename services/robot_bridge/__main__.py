@@ -9,11 +9,12 @@ import numpy as np
 
 from common import topics
 from common.priority import BRIDGE_PRIORITY, run_before_others
-from common.record import read_parts
+from common.record import read_parts, settle_parts
 from common.run_service import end_process, run_service
 from common.service import Service
+from common.surviving_counts import SurvivingCounts
 from services.robot_bridge.bookkeeping import Totals
-from services.robot_bridge.bridge import RobotBridge
+from services.robot_bridge.bridge import SURVIVING_COUNTS, RobotBridge
 from services.robot_bridge.config import RobotBridgeConfig
 from services.robot_bridge.tasks import load_task
 
@@ -23,6 +24,7 @@ logger = logging.getLogger(__name__)
 def serve(service: Service, config: RobotBridgeConfig) -> None:
     """Build the task and run the bridge."""
     settings = config.robot_bridge
+    settle_parts(Path(config.run.directory))
     totals, latched = _earlier(Path(config.run.directory))
     task = load_task(
         config.task.name,
@@ -33,17 +35,17 @@ def serve(service: Service, config: RobotBridgeConfig) -> None:
         # A restarted bridge must not repeat the starts of the one before.
         rng=np.random.default_rng([config.run.seed, totals.attempts]),
     )
-    bridge = RobotBridge(service, task, settings, totals, latched)
+    surviving_counts = SurvivingCounts(topics.ROBOT_BRIDGE, service.incarnation, SURVIVING_COUNTS)
+    service.closing.callback(surviving_counts.close)
+    bridge = RobotBridge(service, task, settings, totals, latched, surviving_counts)
+    service.write_record()  # before the first count: whoever reads it must know where it is
     if settings.real_time_priority and settings.pacing == "realtime":
         logger.info("%s", run_before_others(BRIDGE_PRIORITY))
     bridge.run()
 
 
 def _earlier(directory: Path) -> tuple[Totals, str | None]:
-    """What the last incarnation of this run's bridge last wrote: its counts, and an emergency stop in force.
-
-    At most a second is counted again.
-    """
+    """What the last incarnation of this run's bridge has left: its counts, and an emergency stop in force."""
     # A bridge that has not come as far as its task, as this one, has written a part without counts.
     parts = [part for part in read_parts(directory, topics.ROBOT_BRIDGE) if "steps" in part.get("counters", {})]
     if not parts:

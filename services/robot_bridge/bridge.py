@@ -13,7 +13,7 @@ answer, and the world's time moves by one cycle per step.
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from common.codec import encode
 from common.inbox import Arrived
 from common.messages import Action, ActionSource, Finished, Float32Array
 from common.service import Service
+from common.surviving_counts import SurvivingCounts
 from services.robot_bridge.answers import Answers
 from services.robot_bridge.bookkeeping import CycleCounts, EpisodeResult, Ledger, Totals
 from services.robot_bridge.config import RobotBridgeSettings
@@ -39,6 +40,8 @@ REPUBLISH_NS = 1_000_000_000
 """In lockstep, a TimeStep is published again after this long without an answer."""
 WAITING_TOLD_NS = 10_000_000_000
 """How often the log says what the robot waits for."""
+SURVIVING_COUNTS = tuple(field.name for counted in (Totals, CycleCounts) for field in fields(counted))
+"""What is known of a killed bridge to the last TimeStep."""
 PEERS = (topics.ACTOR, topics.REPLAY)
 """Without these no attempt starts: nobody would act, or nothing would be kept."""
 
@@ -53,6 +56,7 @@ class RobotBridge:
         settings: RobotBridgeSettings,
         totals: Totals,
         latched: str | None = None,
+        surviving_counts: SurvivingCounts | None = None,
     ) -> None:
         self._service, self._task, self._settings = service, task, settings
         self._clock, self._spec = service.clock, task.spec
@@ -63,6 +67,8 @@ class RobotBridge:
         self._watchdog.latched = latched
         self._ledger = Ledger(self._spec, totals)
         self.counts = CycleCounts()
+        self._surviving_counts = surviving_counts
+        self._keep_counts()
         self._time_steps = TimeStepStream(service, self._spec, settings, self.counts)
         self._answers = Answers(service, self._spec, self.counts)
         self._finished_publisher = service.transport.publisher(topics.FINISHED)
@@ -166,6 +172,7 @@ class RobotBridge:
             self._count_cycle()
             self._advance_world()
             self._ledger.end_reset_cycle()
+            self._keep_counts()
 
     # ------------------------------------------------------------------ one cycle
 
@@ -294,6 +301,8 @@ class RobotBridge:
             reward=reward,
             terminated=terminated,
             truncated=truncated,
+            # Before it leaves: of a bridge that is killed now, nobody must see more than it has counted.
+            keep_counts=self._keep_counts,
         )
         self._answers.expect(time_step)
 
@@ -382,6 +391,10 @@ class RobotBridge:
         logger.warning("resumed: the robot may move")
         return "resumed"
 
+    def _keep_counts(self) -> None:
+        if self._surviving_counts:
+            self._surviving_counts.set((*vars(self._ledger.totals).values(), *vars(self.counts).values()))
+
     def counters(self) -> dict[str, float]:
         """Counts and gauges for the heartbeat and the record."""
         return {
@@ -404,4 +417,5 @@ class RobotBridge:
             "seed": self._service.run.seed,
             "steps_total": self._settings.steps,
             "latched": self._watchdog.latched,
+            "surviving_counts": self._surviving_counts.description() if self._surviving_counts else None,
         }

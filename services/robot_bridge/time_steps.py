@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,8 +54,9 @@ class TimeStepStream:
         reward: float,
         terminated: bool,
         truncated: bool,
+        keep_counts: Callable[[], None],
     ) -> TimeStep:
-        """Publish what the sensors show now and what led to it.
+        """Publish what the sensors show now and what led to it; ``keep_counts`` is called once it has its number.
 
         Raises:
             ServiceError: a sensor or the reward is not finite or not of the TaskSpec's shape; nothing was published.
@@ -87,6 +89,7 @@ class TimeStepStream:
         )
         self._payload = encode(time_step)
         self._counts.produced += 1
+        keep_counts()
         self.journal.put(time_step.seq, self._payload)
         return time_step
 

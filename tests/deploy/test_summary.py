@@ -157,6 +157,7 @@ def test_the_summary_of_a_run_with_several_incarnations(tmp_path: Path) -> None:
         "backend": "namespaces",
         "uplink": {"kernel_bytes": 3300, "record_bytes": 3030, "ratio": 1.0891},
         "downlink": {"kernel_bytes": 500, "record_bytes": 100, "ratio": 5.0},
+        "received": {"local": {}, "remote": {}},
     }
     assert [(f["service"], f["incarnation"]) for f in values["service_failures"]] == [
         ("robot_bridge", 100),

@@ -39,17 +39,32 @@ def test_bytes_per_key_are_of_all_services() -> None:
 def test_the_kernel_s_bytes_stand_beside_the_record_s() -> None:
     # The uplink is what the local host sent: 1033 by the record.
     part = network_part([], kernel={"local": (1100, 90), "remote": (260, 80)})
-    table = network_link("namespaces", part, SENT, load_placement("remote_only").host)
+    table = network_link("namespaces", part, SENT, {}, load_placement("remote_only").host)
     assert table["uplink"] == {"kernel_bytes": 1100, "record_bytes": 1033, "ratio": 1.0649}
     assert table["downlink"] == {"kernel_bytes": 260, "record_bytes": 130, "ratio": 2.0}
 
 
 def test_a_relay_has_no_kernel_bytes() -> None:
-    table = network_link("relay", network_part([]), SENT, load_placement("remote_only").host)
+    table = network_link("relay", network_part([]), SENT, {}, load_placement("remote_only").host)
     assert table["uplink"] == {"kernel_bytes": None, "record_bytes": 1033, "ratio": None}
 
 
 def test_a_link_without_traffic_has_no_ratio() -> None:
     nothing: dict[str, Counter[str]] = {service: Counter() for service in SERVICES}
     part = network_part([], kernel={"local": (0, 0), "remote": (0, 0)})
-    assert network_link("namespaces", part, nothing, load_placement("remote_only").host)["uplink"]["ratio"] is None
+    assert network_link("namespaces", part, nothing, {}, load_placement("remote_only").host)["uplink"]["ratio"] is None
+
+
+def test_what_came_to_each_host_shows_which_keys_have_crossed() -> None:
+    received = {
+        "robot_bridge": Counter({"status": 30}),
+        "actor": Counter({"timestep": 1000, "status": 30, "policy": 300}),
+        "replay": Counter({"experience": 2000, "status": 30}),
+        "learner": Counter({"status": 30}),
+    }
+    part = network_part([], kernel={"local": (1100, 90), "remote": (260, 80)})
+    table = network_link("namespaces", part, SENT, received, load_placement("remote_local").host)
+    assert table["received"] == {
+        "local": {"policy": 300, "status": 60, "timestep": 1000},
+        "remote": {"experience": 2000, "status": 60},
+    }

@@ -8,12 +8,21 @@ import signal
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from common import topics
+from common.codec import decode
+from common.config import load_config
+from common.messages import TimeStep
 from common.record import read_parts
+from common.run_settings import TransportSettings
 from common.topics import SERVICES
+from common.transport import ZenohTransport
+from services.robot_bridge.config import RobotBridgeConfig
+from tests.helpers import free_port
 
 ROOT = Path(__file__).parents[2]
 START_S = 120.0
@@ -94,18 +103,61 @@ class RingProcesses:
 
     def counter(self, service: str, name: str) -> float:
         """A count of the service's newest incarnation, as of its last part; -1 before there is one."""
-        parts = read_parts(self.run_dir, service)
+        parts = self.parts(service)
         return float(parts[-1]["counters"].get(name, 0)) if parts else -1.0
+
+    def parts(self, service: str) -> list[dict[str, Any]]:
+        """What each incarnation of the service has left in the record."""
+        return read_parts(self.run_dir, service)
 
     def incarnations(self, service: str) -> int:
         """How often the service has been started."""
-        return len(read_parts(self.run_dir, service))
+        return len(self.parts(service))
+
+    def listen_to_bridge(self) -> BridgeListener:
+        """Hear what the running bridge publishes, beside the services."""
+        return BridgeListener(self._configs / "robot_bridge.toml")
 
     def summary(self) -> dict[str, Any]:
         """The run's summary, made by the user's command."""
         subprocess.run([sys.executable, "-m", "deploy.summary", str(self.run_dir)], cwd=ROOT, check=True)
         summary: dict[str, Any] = json.loads((self.run_dir / "summary.json").read_text())
         return summary
+
+
+class BridgeListener:
+    """Numbers of the TimeSteps that went by, per incarnation of the bridge."""
+
+    def __init__(self, config: Path) -> None:
+        settings = load_config(RobotBridgeConfig, config)
+        bridge = settings.transport
+        endpoints = TransportSettings(
+            listen_real_time=f"tcp/127.0.0.1:{free_port()}",
+            listen_bulk=f"tcp/127.0.0.1:{free_port()}",
+            connect_real_time=[bridge.listen_real_time],
+            connect_bulk=[bridge.listen_bulk],
+        )
+        self._heard_s = time.monotonic()
+        self.heard: defaultdict[int, set[int]] = defaultdict(set)
+        self._transport = ZenohTransport(settings.run, endpoints)
+        for topic in (topics.TIME_STEP, topics.TIME_STEP_RESENT):
+            self._transport.subscribe(topic, self._hear)
+
+    def __enter__(self) -> BridgeListener:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._transport.close()
+
+    def _hear(self, payload: bytes) -> None:
+        time_step = decode(payload, TimeStep)
+        self.heard[time_step.incarnation].add(time_step.seq)
+        self._heard_s = time.monotonic()
+
+    @property
+    def quiet_for_s(self) -> float:
+        """Seconds since the last TimeStep."""
+        return time.monotonic() - self._heard_s
 
 
 def start_all(ring: RingProcesses, order: tuple[str, ...] = SERVICES) -> None:

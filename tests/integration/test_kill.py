@@ -5,6 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from common.frame_ring import RING_FILE, RingReader
 from tests.integration.ring_processes import SMALL_AND_FAST, RingProcesses, options, start_all, wait_until
 
 MORE_STEPS = 100
@@ -39,7 +42,7 @@ def test_a_killed_learner_or_replay_loses_nothing(tmp_path: Path) -> None:
     assert experience["produced"] > 2 * MORE_STEPS
 
 
-def test_a_killed_actor_or_bridge_loses_no_more_than_it_held(tmp_path: Path) -> None:
+def test_what_a_killed_actor_or_bridge_held_is_reported_exactly(tmp_path: Path) -> None:
     with RingProcesses(tmp_path, "noise_frames", *ENDLESS, *SETTINGS) as ring:
         start_all(ring)
         wait_until(lambda: ring.counter("replay", "rows") > MORE_STEPS, "experience is persisted")
@@ -56,7 +59,19 @@ def test_a_killed_actor_or_bridge_loses_no_more_than_it_held(tmp_path: Path) -> 
         wait_until(lambda: ring.counter("robot_bridge", "unacknowledged") < 15, "the gap has been filled")
 
         steps = ring.counter("robot_bridge", "steps")
-        ring.kill("robot_bridge")
+        with ring.listen_to_bridge() as listener:
+            wait_until(lambda: listener.heard, "the bridge is heard")
+            # Without an actor nobody acknowledges: all that comes now is lost with the bridge.
+            ring.kill("actor")
+            wait_until(lambda: ring.counter("robot_bridge", "unacknowledged") > 15, "experience waits at the bridge")
+            ring.kill("robot_bridge")
+            wait_until(lambda: listener.quiet_for_s > 0.5, "what was on its way has been heard")
+        ((killed, heard),) = listener.heard.items()
+        published = max(heard) + 1
+        counted = ring.parts("robot_bridge")[-1]["counters"]["produced"]
+        # It counts before it publishes: the last one may have stayed in the dead process.
+        assert published <= counted <= published + 1
+        ring.start("actor")
         ring.start("robot_bridge")
         wait_until(lambda: ring.incarnations("robot_bridge") == 2, "the bridge is back, as a new incarnation")
         wait_until(lambda: ring.counter("robot_bridge", "steps") > steps + MORE_STEPS, "the run goes on")
@@ -64,9 +79,27 @@ def test_a_killed_actor_or_bridge_loses_no_more_than_it_held(tmp_path: Path) -> 
         summary = end(ring)
     experience = summary["experience"]
     assert experience["duplicated"] == 0
-    # Each held what had not been acknowledged: a period of 0.1 s and the way there, at 50 cycles a second.
-    assert experience["lost"] <= 2 * 20
-    assert experience["persisted"] > 2 * MORE_STEPS
+    rows = rows_of(ring.run_dir / RING_FILE)
+    assert experience["persisted"] == len(rows) > 2 * MORE_STEPS
+    killed_bridge, last_bridge = ring.parts("robot_bridge")
+    assert killed_bridge["incarnation"] == killed
+    assert killed_bridge["counters"]["produced"] == counted
+    assert experience["produced"] == counted + last_bridge["counters"]["produced"]
+    missing = set(range(counted)) - set(rows["seq"][rows["incarnation"] == killed].tolist())
+    assert (rows["incarnation"] == last_bridge["incarnation"]).sum() == last_bridge["counters"]["produced"]
+    assert experience["lost"] == len(missing) > 15
+    # Not a step is counted twice or left out either.
+    assert summary["steps"] == killed_bridge["counters"]["steps"] + last_bridge["counters"]["cycles"]
+    assert summary["cycles"] == killed_bridge["counters"]["cycles"] + last_bridge["counters"]["cycles"]
+
+
+def rows_of(path: Path) -> Any:
+    """All rows of a ring that has not wrapped."""
+    ring = RingReader(path)
+    try:
+        return ring.read_rows(np.arange(ring.rows_appended)).copy()
+    finally:
+        ring.close()
 
 
 def end(ring: RingProcesses) -> dict[str, Any]:

@@ -73,6 +73,8 @@ def test_the_kernel_counts_the_bytes_that_the_record_assigns_to_the_link(mode: s
     crossing, staying = ("timestep", "experience") if mode == "remote_only" else ("experience", "timestep")
     assert summary["bytes_per_key"][crossing] > 0.9 * frames
     assert summary["bytes_per_key"][staying] > 0.9 * frames
+    assert link["received"]["remote"][crossing] > 0.9 * frames
+    assert not any(key.startswith(staying) for key in link["received"]["local" if mode == "remote_only" else "remote"])
     # Each frame crosses once: what stays on one computer is not in the kernel's count.
     assert link["uplink"]["kernel_bytes"] < 1.3 * frames
 

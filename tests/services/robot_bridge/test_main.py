@@ -33,6 +33,7 @@ def serve_in(directory, **sections):
     """Run a bridge that has nothing left to do; return its service."""
     service = SoloService(topics.ROBOT_BRIDGE, InMemoryNetwork(), directory, EventClock())
     serve(service, config_of(directory, **sections))
+    service.closing.close()
     return service
 
 
