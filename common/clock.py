@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 
 class Clock(Protocol):
-    """A monotonic clock and the ways to wait on it."""
+    """Time, and every way to wait for it or for someone.
+
+    Services wait through their clock only, on conditions and in threads of its making. A simulated clock then decides
+    who runs when, and a run of all services is the same each time.
+    """
 
     def now_ns(self) -> int:
         """Monotonic time, nanoseconds."""
@@ -19,8 +24,33 @@ class Clock(Protocol):
         """Wait on the held ``condition`` until it is notified (True) or the deadline has passed (False)."""
         ...
 
+    def wait(self, condition: threading.Condition, timeout_s: float | None = None) -> bool:
+        """Wait on the held ``condition`` until it is notified (True) or ``timeout_s`` is over (False)."""
+        ...
 
-class SystemClock:
+    def condition(self) -> threading.Condition:
+        """Make a condition to wait on."""
+        ...
+
+    def thread(self, target: Callable[[], None], name: str) -> threading.Thread:
+        """Make a thread that does not keep the process alive; not started."""
+        ...
+
+
+class _SystemThreads:
+    """Waiting, conditions and threads of the operating system."""
+
+    def wait(self, condition: threading.Condition, timeout_s: float | None = None) -> bool:
+        return condition.wait(timeout_s)
+
+    def condition(self) -> threading.Condition:
+        return threading.Condition()
+
+    def thread(self, target: Callable[[], None], name: str) -> threading.Thread:
+        return threading.Thread(target=target, name=name, daemon=True)
+
+
+class SystemClock(_SystemThreads):
     """The computer's monotonic clock."""
 
     def now_ns(self) -> int:
@@ -31,8 +61,11 @@ class SystemClock:
         return remaining_s > 0 and condition.wait(remaining_s)
 
 
-class FakeClock:
-    """A clock that stands still until it is told; waiting moves it straight to the deadline."""
+class FakeClock(_SystemThreads):
+    """A clock that stands still until it is told; waiting for a deadline moves it straight there.
+
+    What waits for a while only, in the background, waits in real time.
+    """
 
     def __init__(self, now_ns: int = 1_000_000_000) -> None:
         self._now_ns = now_ns

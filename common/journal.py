@@ -239,7 +239,8 @@ class JournalSender:
         self._head_publisher = transport.publisher(head)
         self._on_acknowledgement = on_acknowledgement
         self._lock = threading.Lock()
-        self._wake = threading.Condition()
+        self._wake = self._clock.condition()
+        self._pace = self._clock.condition()
         self._acknowledgements: list[Acknowledgement] = []
         self._stopping = False
         self.resent = 0
@@ -247,7 +248,7 @@ class JournalSender:
         self.refused = 0
         """Acknowledgements that could not be read."""
         transport.subscribe(acknowledgement, self._receive)
-        self._thread = threading.Thread(target=self._run, name=f"journal {topic.name}", daemon=True)
+        self._thread = self._clock.thread(self._run, f"journal {topic.name}")
 
     def start(self) -> None:
         """Begin to repair."""
@@ -255,9 +256,10 @@ class JournalSender:
 
     def stop(self) -> None:
         """Stop repairing; what is unacknowledged is given up."""
-        with self._wake:
-            self._stopping = True
-            self._wake.notify()
+        self._stopping = True
+        for condition in (self._wake, self._pace):
+            with condition:
+                condition.notify()
         if self._thread.is_alive():
             self._thread.join()
 
@@ -305,7 +307,7 @@ class JournalSender:
         while True:
             with self._wake:
                 if not self._acknowledgements and not self._stopping:
-                    self._wake.wait(HEAD_PERIOD_S)
+                    self._clock.wait(self._wake, HEAD_PERIOD_S)
                 if self._stopping:
                     return
                 acknowledgements, self._acknowledgements = self._acknowledgements, []
@@ -334,9 +336,9 @@ class JournalSender:
                 return
             self._resent_publisher.put(payload)
             self.resent += 1
-            with self._wake:
-                # A newer acknowledgement knows better what is missing.
-                if self._stopping or self._wake.wait_for(lambda: self._stopping, len(payload) / self._bytes_per_s):
-                    return
-                if self._acknowledgements:
-                    return
+            with self._pace:
+                if not self._stopping:
+                    self._clock.wait(self._pace, len(payload) / self._bytes_per_s)
+            # A newer acknowledgement knows better what is missing.
+            if self._stopping or self._acknowledgements:
+                return

@@ -57,12 +57,14 @@ class Service:
         run: RunSettings,
         transport: Transport,
         clock: Clock | None = None,
+        incarnation: int | None = None,
     ) -> None:
         self.name = name
         self.run = run
         self.transport = transport
         self.clock = clock or SystemClock()
-        self.incarnation = time.time_ns()
+        self.incarnation = time.time_ns() if incarnation is None else incarnation
+        """Start of this process, nanoseconds since 1970, unless given: larger is newer."""
         self.started_ns = self.clock.now_ns()
         self.refusals = Refusals()
         self.record = RunRecord(Path(run.directory), name, self.incarnation)
@@ -70,11 +72,13 @@ class Service:
         """Set by a signal, a ``stop`` command, or a newer incarnation of this service."""
         self.failure: str | None = None
         """Why the service has to end with exit code 1."""
-        self.wake = threading.Condition()
+        self.wake = self.clock.condition()
         """Notified when a message has arrived or the service is asked to stop."""
         self.state = "starting"
         self.counters: Callable[[], dict[str, float]] = dict
         """The service's counts and gauges: sent with the heartbeat, recorded as metrics."""
+        self.wall_s: Callable[[], float] = lambda: (self.clock.now_ns() - self.started_ns) / 1e9
+        """Seconds since the service started, for the record."""
         self.details: Callable[[], dict[str, Any]] = dict
         """What else belongs into the service's part of the record."""
         self.closing = contextlib.ExitStack()
@@ -82,8 +86,8 @@ class Service:
         self._peers: dict[str, Peer] = {}
         self._foreign: set[str] = set()
         self._finished: Finished | None = None
-        self._heart_wake = threading.Condition()
-        self._heart = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+        self._heart_wake = self.clock.condition()
+        self._heart = self.clock.thread(self._beat, f"{name} heartbeat")
         self._heart_stop = False
         self._status_publisher = transport.publisher(topics.STATUS)
         self._status_inbox = Inbox(
@@ -114,6 +118,12 @@ class Service:
             self.stopping.set()
         with self.wake:
             self.wake.notify_all()
+
+    def pause(self, seconds: float) -> None:
+        """Do nothing for a while, or until a message comes or the service is asked to stop."""
+        with self.wake:
+            if not self.stopping.is_set():
+                self.clock.wait(self.wake, seconds)
 
     def close(self) -> None:
         """Say goodbye, write the last part, leave the mesh."""
@@ -169,7 +179,7 @@ class Service:
                 warned_ns = self.clock.now_ns()
                 logger.warning("no robot_bridge has answered yet; is it running, and do the endpoints match?")
             # Nobody there answers at once: ask again in a moment.
-            self.stopping.wait(max(0.0, 0.1 - (self.clock.now_ns() - asked_ns) / 1e9))
+            self.pause(max(0.0, 0.1 - (self.clock.now_ns() - asked_ns) / 1e9))
         return None
 
     def serve_commands(self, handlers: dict[str, Callable[[], str]]) -> None:
@@ -211,7 +221,7 @@ class Service:
                 if all(state in ("starting", "drained", "gone") for state in self._peer_states().values()):
                     return True
             with self.wake:
-                self.wake.wait(0.02)
+                self.clock.wait(self.wake, 0.02)
 
     def _ends_early(self) -> bool:
         return self.stopping.is_set() or (self._finished is not None and self._finished.reason != "steps")
@@ -228,7 +238,7 @@ class Service:
                 if self._heart_stop:
                     return
                 if not self._status_inbox:
-                    self._heart_wake.wait(HEARTBEAT_S / 2)
+                    self.clock.wait(self._heart_wake, HEARTBEAT_S / 2)
             self._take_messages()
             now_ns = self.clock.now_ns()
             if now_ns >= next_status_ns:
@@ -288,7 +298,7 @@ class Service:
     def write_record(self) -> None:
         """Record counts and details as they are now; done once a second without being asked."""
         counters = self.counters()
-        wall_s = (self.clock.now_ns() - self.started_ns) / 1e9
+        wall_s = self.wall_s()
         self.record.part(
             {
                 "state": self.state,

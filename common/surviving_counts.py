@@ -27,7 +27,7 @@ class SurvivingCounts:
 
     def __init__(self, service: str, incarnation: int, names: Sequence[str], folder: Path = MEMORY_FILE_SYSTEM) -> None:
         self.names = tuple(names)
-        self.path: Path | None = folder / f"relod-{service}-{incarnation}"
+        self.path: Path | None = folder / f"relod-{service}-{incarnation}-{os.getpid()}"
         """None where there is no memory file system: the counts then end with the process."""
         self._format = struct.Struct(f"<{len(self.names)}q")
         self._file = -1

@@ -241,6 +241,11 @@ class InMemoryNetwork:
         """Join the mesh."""
         return InMemoryTransport(self, run)
 
+    def deliver(self, topic: Topic, payload: bytes, callbacks: list[PayloadCallback]) -> None:
+        """Hand a message to those who listened when it was published."""
+        for callback in callbacks:
+            callback(payload)
+
 
 class InMemoryTransport:
     """One service's session on an :class:`InMemoryNetwork`."""
@@ -265,8 +270,7 @@ class InMemoryTransport:
                     self._network.cache[key] = (self, payload)
                 listeners = [c for pattern, c in self._network.subscribers[topic.name] if pattern.fullmatch(key)]
             if not self._network.drops(topic, payload):
-                for callback in listeners:
-                    callback(payload)
+                self._network.deliver(topic, payload, listeners)
 
         return _CountingPublisher(topic.name, put, self.bytes_sent, self._lock)
 

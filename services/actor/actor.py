@@ -66,7 +66,7 @@ class Actor:
             while not service.stopping.is_set() and service.finished is None:
                 with service.wake:
                     if not (self._time_steps or self._resent):
-                        service.wake.wait(0.1)
+                        service.clock.wait(service.wake, 0.1)
                 self.take_time_steps()
             self._drain()
         finally:
@@ -145,7 +145,7 @@ class Actor:
             if service.stopping.is_set() or service.finished is not None:
                 return
             with service.wake:
-                service.wake.wait(0.05)
+                service.clock.wait(service.wake, 0.05)
 
     def _drain(self) -> None:
         finished = self._service.finished

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections import OrderedDict, deque
 
 from common import topics
@@ -37,7 +36,7 @@ class ExperienceForwarder:
             clock=service.clock,
         )
         self._ack_publisher = service.transport.publisher(topics.TIME_STEP_ACK)
-        self._wake = threading.Condition()
+        self._wake = service.clock.condition()
         self._heads = Inbox(
             service.transport, topics.TIME_STEP_HEAD, StreamHead, self._wake, service.clock, service.refusals
         )
@@ -45,7 +44,7 @@ class ExperienceForwarder:
         self._answers: OrderedDict[tuple[int, int], PolicyExtras] = OrderedDict()
         self._in_hand = 0  # taken from the receiver and not yet with the sender
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="experience", daemon=True)
+        self._thread = service.clock.thread(self._run, "experience")
         self.experiences = 0
         """Experiences sent."""
         self._earns = False
@@ -109,7 +108,7 @@ class ExperienceForwarder:
         while True:
             with self._wake:
                 if not (self._incoming or self._heads or self._stopping):
-                    self._wake.wait(ACKNOWLEDGE_S)
+                    clock.wait(self._wake, ACKNOWLEDGE_S)
                 if self._stopping:
                     return
                 while self._incoming:

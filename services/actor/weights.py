@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 
 from common import topics
 from common.errors import MessageError
@@ -25,12 +24,12 @@ class PolicySwap:
         self.received = 0
         """Policies swapped in."""
         self._service, self._spec = service, spec
-        self._wake = threading.Condition()
+        self._wake = service.clock.condition()
         self._stopping = False
         self._inbox = Inbox(
             service.transport, topics.POLICY, PolicyWeights, self._wake, service.clock, service.refusals
         )
-        self._thread = threading.Thread(target=self._run, name="policy weights", daemon=True)
+        self._thread = service.clock.thread(self._run, "policy weights")
 
     def start(self) -> None:
         """Begin to receive."""
@@ -47,7 +46,7 @@ class PolicySwap:
         while True:
             with self._wake:
                 while not (self._inbox or self._stopping):
-                    self._wake.wait(0.5)
+                    self._service.clock.wait(self._wake)
                 if self._stopping:
                     return
             arrived = self._inbox.take_newest()

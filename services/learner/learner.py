@@ -32,13 +32,14 @@ class PolicyPusher:
 
     def __init__(self, service: Service) -> None:
         self._publisher = service.transport.publisher(topics.POLICY)
-        self._wake = threading.Condition()
+        self._clock = service.clock
+        self._wake = self._clock.condition()
         self._pending: PolicyWeights | None = None
         self._stopping = False
         self.pushes = 0
         self.skipped = 0
         """Policies replaced by a newer one before they were sent."""
-        self._thread = threading.Thread(target=self._run, name="policy push", daemon=True)
+        self._thread = self._clock.thread(self._run, "policy push")
         self._thread.start()
 
     def push(self, weights: PolicyWeights) -> None:
@@ -59,7 +60,7 @@ class PolicyPusher:
         while True:
             with self._wake:
                 while self._pending is None and not self._stopping:
-                    self._wake.wait()
+                    self._clock.wait(self._wake)
                 if self._stopping or self._pending is None:
                     return
                 weights, self._pending = self._pending, None

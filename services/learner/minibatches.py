@@ -38,13 +38,13 @@ class MinibatchSource(ABC):
         self._crop_shape = crop_shape(spec) if spec.has_camera else None
         self._rng = np.random.default_rng([service.run.seed, service.incarnation])
         self._credit_publisher = service.transport.publisher(topics.CREDIT)
-        self._wake = threading.Condition()
+        self._wake = service.clock.condition()
         self._ready: deque[Minibatch] = deque()
         self._expected = 0
         self._stopping = False
         self.dropped = 0
         """Minibatches that were overtaken by the ring's writer, or unusable."""
-        self._thread = threading.Thread(target=self._run, name="minibatches", daemon=True)
+        self._thread = service.clock.thread(self._run, "minibatches")
 
     def start(self) -> None:
         """Begin to ask."""
@@ -60,8 +60,8 @@ class MinibatchSource(ABC):
     def get(self, timeout_s: float) -> Minibatch | None:
         """The next minibatch, or None if none came in time."""
         with self._wake:
-            if not self._ready:
-                self._wake.wait_for(lambda: self._ready or self._stopping, timeout_s)
+            if not (self._ready or self._stopping):
+                self._service.clock.wait(self._wake, timeout_s)
             minibatch = self._ready.popleft() if self._ready else None
             self._wake.notify_all()
         return minibatch
@@ -90,7 +90,7 @@ class MinibatchSource(ABC):
             with self._wake:
                 credit = (self._expected + self._prefetch - len(self._ready), self._expected)
                 if credit == sent and not self._has_arrived() and not self._stopping:
-                    self._wake.wait(CREDIT_S)
+                    clock.wait(self._wake, CREDIT_S)
                 if self._stopping:
                     return
                 credit = (self._expected + self._prefetch - len(self._ready), self._expected)

@@ -86,7 +86,7 @@ class Replay:
             while not service.stopping.is_set() and service.finished is None:
                 with service.wake:
                     if not self._has_work():
-                        service.wake.wait(ACKNOWLEDGE_S)
+                        service.clock.wait(service.wake, ACKNOWLEDGE_S)
                 self.step()
             service.drain(self._is_drained, self._keep)
         finally:

@@ -323,7 +323,7 @@ class RobotBridge:
         waiting = [peer for peer in PEERS if self._service.peer_state(peer) not in ("running", "draining")]
         if waiting or self._watchdog.latched:
             self._tell_waiting(waiting)
-            self._service.stopping.wait(0.05)
+            self._service.pause(0.05)
             return
         logger.info("actor and replay are there: asking for a first answer")
         # An attempt of a single TimeStep, of which no transition comes: no step is counted and the robot stands still.

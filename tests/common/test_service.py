@@ -636,7 +636,7 @@ def test_a_disk_that_refuses_is_counted_and_disturbs_nobody(scene, tmp_path, mon
         actor, replay = scene.service("actor"), scene.service("replay")
         scene.clock.advance(RECORD_S)
         scene.until(lambda: actor.record.dropped > 0)
-        assert replay.peer_state("actor") == "starting"
+        scene.until(lambda: replay.peer_state("actor") == "starting")
     scene.clock.advance(RECORD_S)
     eventually(lambda: (parts := read_parts(tmp_path, "actor")) and parts[0]["record_entries_dropped"] > 0)
 

@@ -42,13 +42,13 @@ def write_part(run_dir: Path, counts: dict[str, Any] | None, state: str = "runni
 
 
 def test_the_last_count_of_a_killed_process_is_in_its_part(tmp_path: Path, memory: Path) -> None:
-    description = {"path": str(memory / "relod-robot_bridge-7"), "names": ["steps", "produced"]}
-    path = write_part(tmp_path, description)
     with subprocess.Popen(
         [sys.executable, "-c", COUNT_AND_WAIT, str(memory)], stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "counted\n"
+        (counts,) = memory.iterdir()
+        path = write_part(tmp_path, {"path": str(counts), "names": ["steps", "produced"]})
         settle_parts(tmp_path)
         assert "surviving_counts" in json.loads(path.read_text()), "it still counts"
         process.send_signal(signal.SIGKILL)

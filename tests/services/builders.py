@@ -67,19 +67,6 @@ class EventClock(FakeClock):
         return True
 
 
-class ClockEvent(threading.Event):
-    """An event whose waiting takes the fake clock's time."""
-
-    def __init__(self, clock: EventClock) -> None:
-        super().__init__()
-        self._clock = clock
-
-    def wait(self, timeout=None) -> bool:
-        if not self.is_set():
-            self._clock.sleep(timeout)
-        return self.is_set()
-
-
 class MemoryRecord:
     """Keeps what a service records."""
 
@@ -119,8 +106,12 @@ class SoloService(Service):
         self.finished_message = None
         if incarnation is not None:
             self.incarnation = incarnation
-        if isinstance(clock, EventClock):
-            self.stopping = ClockEvent(clock)
+
+    def pause(self, seconds) -> None:
+        if not isinstance(self.clock, EventClock):
+            super().pause(seconds)
+        elif not self.stopping.is_set():
+            self.clock.sleep(seconds)
 
     @property
     def finished(self):

@@ -1,0 +1,133 @@
+"""Training in one process: the same every time, with a whole record, and clear words when it cannot."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from common.errors import ConfigError, MessageError
+from deploy.console import Console
+from deploy.episodes import EpisodeTable
+from deploy.stop_signals import StopSignals
+from experiments.train import Training, main, train
+
+ROOT = Path(__file__).parents[2]
+SMALL = (
+    "algorithm.batch_size=8",
+    "algorithm.hidden_size=32",
+    "algorithm.min_size_to_sample=30",
+    "algorithm.policy_push_interval=5",
+    "algorithm.replay_capacity=500",
+    "task.target_half_width=0.4",
+)
+
+
+def small(run_dir: Path, **changes) -> Training:
+    return Training(**{"task": "dot_reacher", "run_dir": run_dir, "steps": 200, "overrides": SMALL, **changes})
+
+
+def test_the_same_options_give_the_same_run_in_any_process(tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "experiments.train",
+        "--task",
+        "visual_dot_reacher",
+        "--seed",
+        "3",
+        "--steps",
+        "150",
+    ]
+    command += [text for setting in SMALL for text in ("--set", setting)]
+    for name, hash_seed in (("one", "1"), ("two", "2")):
+        environment = {"PATH": "", "PYTHONHASHSEED": hash_seed, "HOME": str(tmp_path)}
+        subprocess.run([*command, "--run-dir", str(tmp_path / name)], cwd=ROOT, check=True, env=environment)
+    for file in ("episodes.csv", "actions.csv", "policy.msgpack"):
+        one, two = ((tmp_path / name / file).read_bytes() for name in ("one", "two"))
+        assert one == two, file
+    assert (tmp_path / "one" / "episodes.csv").read_text().count("\n") > 2
+
+
+def test_another_seed_gives_another_run(tmp_path):
+    for seed in (0, 1):
+        train(small(tmp_path / str(seed), seed=seed))
+    one, two = ((tmp_path / str(seed) / "actions.csv").read_bytes() for seed in (0, 1))
+    assert one != two
+
+
+def test_the_record_is_that_of_a_launched_run(tmp_path):
+    values = train(small(tmp_path / "run"))
+    assert values == json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (values["mode"], values["steps"], values["cycles"]) == ("in_process", 200, 200)
+    assert (values["experience"]["lost"], values["experience"]["duplicated"]) == (0, 0)
+    # Every transition from the 30th on earns an update; the last one may have had no time for its own.
+    transitions = values["experience"]["persisted"] - attempts_of(tmp_path / "run")
+    assert transitions - 30 <= values["updates"] <= transitions - 29
+    assert values["policy_version"] == values["updates"] // 5
+    assert values["late_actions"] == values["overruns"] == 0
+    for name in (
+        "run.toml",
+        "learning_curve.png",
+        "metrics/learner.csv",
+        "config/actor.toml",
+        "logs/train.log",
+        "ring",
+    ):
+        assert (tmp_path / "run" / name).exists(), name
+    assert len(EpisodeTable(tmp_path / "run").update()) == values["episodes"] > 0
+
+
+def attempts_of(run_dir: Path) -> int:
+    part = json.loads(next(run_dir.glob("parts/robot_bridge-*.json")).read_text())
+    return int(part["counters"]["attempts"])
+
+
+def test_a_stop_ends_the_run_early_with_a_whole_record(tmp_path):
+    stop = StopSignals()
+    stop.asked_s = 0.0
+    values = train(small(tmp_path / "run", steps=100_000), stop=stop)
+    assert values["steps"] < 100_000
+    assert values["experience"]["lost"] == 0
+    assert values["service_failures"] == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"task": "dot_racher"}, "dot_reacher"),
+        ({"overrides": ("task.time_limitt=3",)}, "time_limit"),
+        ({"overrides": ("algorithm.preset=none_such",)}, "none_such"),
+        ({"overrides": ("robot_bridge.pacing=realtime",)}, "lockstep"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_with_the_reason(changes, message, tmp_path):
+    with pytest.raises(ConfigError, match=message):
+        train(small(tmp_path / "run", **changes))
+
+
+def test_a_service_that_fails_ends_the_run_with_its_reason(tmp_path, monkeypatch):
+    def fail(*_):
+        raise MessageError("the ring is full of water")
+
+    monkeypatch.setattr("services.replay.replay.RingWriter.append", fail)
+    monkeypatch.setattr("services.replay.replay.RingWriter.contains", lambda *_: 1 // 0)
+    with pytest.raises(Exception, match="replay: unexpected ZeroDivisionError"):
+        train(small(tmp_path / "run"))
+
+
+def test_a_folder_with_something_in_it_is_left_alone(tmp_path, capsys):
+    (tmp_path / "precious").write_text("data")
+    assert main(["--task", "dot_reacher", "--run-dir", str(tmp_path)]) == 1
+    assert "expected a folder that is empty" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["precious"]
+
+
+def test_progress_and_summary_are_shown(tmp_path, capsys):
+    train(small(tmp_path / "run"), Console())
+    shown = capsys.readouterr().out
+    assert "summary.json" in shown
+    assert "200 (" in shown
