@@ -159,11 +159,11 @@ class TimeStep:
     frame_capture_ns: Annotated[Int64Array, Array("int64", ("k",))]
     """Capture times of the new frames, bridge's monotonic clock."""
     frames: Annotated[UInt8Array, Array("uint8", ("k", "H", "W", "C"))]
-    """The new camera frames, oldest first."""
+    """The new camera frames, oldest first; channels are red, green, blue."""
     proprioception: Annotated[Float32Array, Array("float32", ("P",))]
     """Physical units of the task."""
     action: Annotated[Float32Array, Array("float32", ("A",))]
-    """Command in force at the cycle's end, clipped to the TaskSpec; zeros if ``action_source`` is none."""
+    """Command in force at the cycle's end, clipped to the TaskSpec; zeros, so clipped, if ``action_source`` is none."""
     action_source: ActionSource
     """What determined ``action``."""
     answered_seq: Annotated[int, Bounds(low=-1)]
@@ -309,13 +309,17 @@ class ArrayMinibatch:
     next_frame_index: Annotated[Int64Array, Array("int64", ("B", "S"))]
     """Next observation stacks."""
     proprioception: Annotated[Float32Array, Array("float32", ("B", "P"))]
+    """Of the observations, physical units."""
     previous_action: Annotated[Float32Array, Array("float32", ("B", "A"))]
     """Command in force before the observation, physical units; zeros at the start of an attempt."""
     next_proprioception: Annotated[Float32Array, Array("float32", ("B", "P"))]
+    """Of the next observations, physical units."""
     action: Annotated[Float32Array, Array("float32", ("B", "A"))]
     """Applied action, physical units."""
     reward: Annotated[Float32Array, Array("float32", ("B",))]
+    """Reward of the cycle between the two observations."""
     terminated: Annotated[UInt8Array, Array("uint8", ("B",))]
+    """1 where the next observation reached the goal."""
 
 
 @dataclass(frozen=True)
@@ -389,6 +393,7 @@ class CommandReply:
     """Answer to a Command."""
 
     accepted: bool
+    """True if the service does what was asked."""
     detail: str
     """Why not, or what was done."""
 

@@ -193,7 +193,10 @@ class Replay:
         if self._maps:
             self._minibatches.put(encode(RowMinibatch(learner, self._sent, rows)))
         else:
-            for part in array_minibatch(self._ring, rows, learner, self._sent, int(self._settings.message_mib * 2**20)):
+            parts = array_minibatch(self._ring, rows, learner, self._sent, int(self._settings.message_mib * 2**20))
+            if not parts:
+                return False
+            for part in parts:
                 self._minibatches.put(encode(part))
         self._sent += 1
         self._sent_total += 1
