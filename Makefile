@@ -13,10 +13,10 @@ python = .venv/bin/python
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test check soak format environment lock clean
+.PHONY: help demo test test-stable-baselines3 check soak format environment lock clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-23s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo
 	@echo "  make demo [SEED=0] [TASK=visual_dot_reacher] [STEPS=7000] [MODE=local_only] [NETWORK=] [RUN_DIR=]"
 	@echo "  Every target that runs Python makes .venv/ first; PYTHON= chooses its interpreter (3.11 or 3.12)."
@@ -34,6 +34,10 @@ check: environment ## format, lint, types and import rules; edits nothing
 test: environment ## run every test
 	$(python) -m pytest
 
+test-stable-baselines3: ## train a stock learner on a task through Gymnasium, in an environment of its own
+	@PYTHON='$(PYTHON)' deploy/bootstrap/environment.sh sync .venv-sb3 tests/stable_baselines3/requirements.lock
+	.venv-sb3/bin/python tests/stable_baselines3/train.py
+
 soak: environment ## run for 21 minutes; fail if memory or open files grow
 	$(python) -m benchmarks.soak
 
@@ -48,4 +52,4 @@ lock: ## write requirements.lock anew from pyproject.toml
 	@PYTHON='$(PYTHON)' deploy/bootstrap/environment.sh lock
 
 clean: ## remove the environment and the tools' caches; runs/ stays
-	rm -rf .venv .uv .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-sb3 .uv .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
