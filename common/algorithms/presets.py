@@ -22,6 +22,8 @@ class SACConfig:
     """Width of the two hidden layers of actor and critics."""
     encoder_strides: tuple[int, ...] = (2, 2, 2, 1)
     """Strides of the encoder's four convolutions; unused by a task without camera."""
+    zero_initialised_head: bool = True
+    """The actor's last layer starts at zero (thesis 4.2, guideline 1 of 7.3); False: at random, as torch would."""
     actor_lr: float = 1e-3
     """Adam's step size for the actor."""
     critic_lr: float = 1e-3
@@ -119,6 +121,7 @@ SAC_PRESETS: dict[str, SACConfig] = {
     # Nothing can be learnt from noise: small, so that the link and the buffers are what is tested.
     "noise_frames": replace(_DOT_REACHER, encoder_strides=(2, 2, 2, 1), replay_capacity=4_000),
     "dm_reacher": replace(_MIN_TIME, replay_capacity=10_000),
+    "dm_ball_in_cup": replace(_MIN_TIME, replay_capacity=10_000),
     "create": _MIN_TIME,
     "ur5": replace(_DENSE, min_size_to_sample=2000),
     "vector": _MIN_TIME,
@@ -164,6 +167,8 @@ def _converted(name: str, annotation: str, value: object) -> object:
     integer = isinstance(value, int) and number
     match annotation:
         case "int" if integer:
+            return value
+        case "bool" if isinstance(value, bool):
             return value
         case "float" | "float | None" if number:
             return float(value)  # type: ignore[arg-type]  # number says so

@@ -15,6 +15,14 @@ from services.robot_bridge.tasks.base import Outcome, SensorReading, Task
 TASKS = {
     "dot_reacher": "services.robot_bridge.tasks.dot_reacher:DotReacher",
     "visual_dot_reacher": "services.robot_bridge.tasks.visual_dot_reacher:VisualDotReacher",
+    "reacher_easy": "services.robot_bridge.tasks.reacher:ReacherEasy",
+    "reacher_easy_visual": "services.robot_bridge.tasks.reacher:ReacherEasyVisual",
+    "reacher_hard": "services.robot_bridge.tasks.reacher:ReacherHard",
+    "reacher_hard_visual": "services.robot_bridge.tasks.reacher:ReacherHardVisual",
+    "reacher_extreme": "services.robot_bridge.tasks.reacher:ReacherExtreme",
+    "reacher_extreme_visual": "services.robot_bridge.tasks.reacher:ReacherExtremeVisual",
+    "ball_in_cup": "services.robot_bridge.tasks.ball_in_cup:BallInCup",
+    "ball_in_cup_visual": "services.robot_bridge.tasks.ball_in_cup:BallInCupVisual",
     "noise_frames": "services.robot_bridge.tasks.noise_frames:NoiseFrames",
 }
 """Task id -> ``module:Class``; imported only when chosen, so that a robot's driver burdens no one else."""

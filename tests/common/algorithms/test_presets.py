@@ -17,6 +17,7 @@ TABLE = {
     "ur5": (100_000, 2000, 0.6, 3e-4, 3e-4, 0.005, 0.005, 0.99),
     "vector": (100_000, 1000, 1.0, 1e-3, 1e-4, 0.01, 0.05, 1.0),
     "dm_reacher": (10_000, 1000, 1.0, 1e-3, 1e-4, 0.01, 0.05, 1.0),
+    "dm_ball_in_cup": (10_000, 1000, 1.0, 1e-3, 1e-4, 0.01, 0.05, 1.0),
     "franka": (100_000, 5000, 0.6, 3e-4, 3e-4, 0.005, 0.005, 0.99),
 }
 
@@ -61,6 +62,7 @@ def test_overrides_replace_settings_and_convert_lists_and_integers():
     assert (config.encoder_strides, config.discount, config.batch_size) == ((2, 1, 1, 1), 1.0, 8)
     assert isinstance(config.discount, float)
     assert resolve_config("sac", "create", {}) == SAC_PRESETS["create"]
+    assert resolve_config("sac", "create", {"zero_initialised_head": False}).zero_initialised_head is False
 
 
 @pytest.mark.parametrize(
@@ -84,6 +86,8 @@ def test_overrides_replace_settings_and_convert_lists_and_integers():
         ("weights_dtype", "bfloat16"),
         ("log_std_low", -5.0),
         ("adam_betas", [0.9, 1.0]),
+        ("zero_initialised_head", 0),
+        ("zero_initialised_head", "false"),
     ],
 )
 def test_a_bad_value_is_refused_naming_key_value_and_what_was_expected(name, value):
