@@ -2,9 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
 
 from common.messages import Float32Array, UInt8Array
+
+
+class DeviceArray(Protocol):
+    """An array that is already on the learner's device: a torch tensor, described without torch, which replay lacks."""
+
+    @property
+    def shape(self) -> Sequence[int]:
+        """As of a numpy array."""
+        ...
+
+    def __getitem__(self, index: Any, /) -> DeviceArray:
+        """As of a numpy array; an array of bool selects."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -14,8 +32,8 @@ class Minibatch:
     The action is the applied one. The previous action is part of the observation; that of o' is ``action`` itself.
     """
 
-    frames: UInt8Array | None
-    """(B, h, w, S * C): the stack's frames along the channels, oldest first; None without camera."""
+    frames: UInt8Array | DeviceArray | None
+    """(B, h, w, S * C) uint8: the stack's frames along the channels, oldest first; None without camera."""
     proprioception: Float32Array
     """(B, P)"""
     previous_action: Float32Array
@@ -26,7 +44,34 @@ class Minibatch:
     """(B,)"""
     terminated: Float32Array
     """(B,): 1 where the goal was reached, the only thing that cuts the bootstrap."""
-    next_frames: UInt8Array | None
-    """(B, h, w, S * C)"""
+    next_frames: UInt8Array | DeviceArray | None
+    """(B, h, w, S * C) uint8"""
     next_proprioception: Float32Array
     """(B, P)"""
+
+    @classmethod
+    def of_rows(
+        cls,
+        first: npt.NDArray[np.void],
+        second: npt.NDArray[np.void],
+        frames: UInt8Array | DeviceArray | None,
+        next_frames: UInt8Array | DeviceArray | None,
+    ) -> Minibatch:
+        """Return the transitions between rows of the experience ring; copies all but the frames.
+
+        Args:
+            first: (B,) rows of o, structured as ``RingLayout.row_dtype``.
+            second: (B,) the rows after them.
+            frames: of o, stacked and cropped.
+            next_frames: of o'.
+        """
+        return cls(
+            frames=frames,
+            proprioception=first["proprioception"].copy(),
+            previous_action=first["action"].copy(),
+            action=second["action"].copy(),
+            reward=second["reward"].copy(),
+            terminated=second["terminated"].astype(np.float32),
+            next_frames=next_frames,
+            next_proprioception=second["proprioception"].copy(),
+        )

@@ -16,9 +16,10 @@ from torch import Tensor, nn
 from common.algorithms.adam import Adam
 from common.algorithms.base import Algorithm, Arrays, random_seeds
 from common.algorithms.presets import SACConfig
+from common.algorithms.upload import upload
 from common.errors import ConfigError
 from common.messages import PolicyWeights, TaskSpec
-from common.minibatch import Minibatch
+from common.minibatch import DeviceArray, Minibatch
 from common.networks.distribution import TanhGaussian
 from common.networks.encoder import Encoder
 from common.networks.mlp import Actor, TwinQ
@@ -107,7 +108,13 @@ class SAC(Algorithm):
         self.log_temperature = nn.Parameter(
             torch.tensor(math.log(config.initial_temperature), dtype=dtype, device=self._device)
         )
-        initial = initial_parameters(spec, config.hidden_size, config.encoder_strides, rng)
+        initial = initial_parameters(
+            spec,
+            config.hidden_size,
+            config.encoder_strides,
+            np.random.default_rng(seed),  # as the actor draws its own: both begin with the same policy
+            zero_initialised_head=config.zero_initialised_head,
+        )
         with torch.no_grad():
             for name, parameter in self._policy_parameters().items():
                 parameter.copy_(torch.from_numpy(initial[name]))
@@ -153,7 +160,7 @@ class SAC(Algorithm):
     def _update_actor_and_temperature(self, observation: Tensor) -> None:
         """Descend eq. 3.13, then move the temperature so that the entropy approaches its target."""
         action, log_probability = self._act(observation)
-        q = self.critic(observation, action).amin(dim=0)
+        q = self.critic(observation, action, frozen=True).amin(dim=0)
         temperature = self.log_temperature.exp()
         actor_loss = (temperature.detach() * log_probability - q).mean()
         entropy = -log_probability.detach().mean()
@@ -206,8 +213,10 @@ class SAC(Algorithm):
         return {name: _array(value).copy() for name, value in self._state().items()}
 
     def load_state_dict(self, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-        """See :class:`Algorithm`."""
+        """See :class:`Algorithm`; on another kind of device it goes on with other random numbers."""
         state = self._state()
+        if _of_another_device(arrays.get("random_state"), state["random_state"]):
+            arrays = {**arrays, "random_state": _array(state["random_state"])}
         for name in sorted(state.keys() | arrays.keys()):
             expected = list(state[name].shape) if name in state else "no such array"
             got = list(arrays[name].shape) if name in arrays else "no such array"
@@ -259,10 +268,10 @@ class SAC(Algorithm):
             next_vector=to_tensor(np.concatenate([next_proprioception, action], axis=1)),
         )
 
-    def _to_tensor(self, array: npt.NDArray[Any]) -> Tensor:
-        # torch refuses to promise that it will not write to a read-only array, and warns.
-        writable = array if array.flags.writeable else array.copy()
-        return torch.from_numpy(writable).to(self._device, non_blocking=True)
+    def _to_tensor(self, array: npt.NDArray[Any] | DeviceArray) -> Tensor:
+        if isinstance(array, np.ndarray):
+            return upload(array, self._device)
+        return torch.as_tensor(array, device=self._device)
 
 
 def _observation(encoder: Encoder | None, frames: Tensor | None, vector: Tensor) -> Tensor:
@@ -275,6 +284,16 @@ def _observation(encoder: Encoder | None, frames: Tensor | None, vector: Tensor)
 def _move(target: nn.Module, source: nn.Module, tau: float) -> None:
     """target <- tau source + (1 - tau) target (algorithm 1)."""
     torch._foreach_lerp_(list(target.parameters()), list(source.parameters()), tau)
+
+
+def _of_another_device(random_state: npt.NDArray[Any] | None, own: Tensor) -> bool:
+    """True if a generator's state is one, but not of this device: a CPU's has 5056 bytes, a GPU's 16."""
+    return (
+        random_state is not None
+        and random_state.dtype == np.uint8
+        and random_state.ndim == 1
+        and 0 < random_state.size != own.numel()
+    )
 
 
 def _array(tensor: Tensor) -> npt.NDArray[Any]:

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from common.errors import RingError
 from common.frame_ring.layout import HEADER_BYTES, RingLayout
 from common.frame_ring.view import BoolArray, RingView, crop_stacks
@@ -73,16 +71,7 @@ class RingReader(RingView):
                 crop_offset if next_crop_offset is None else next_crop_offset,
                 crop_shape,
             )
-        minibatch = Minibatch(
-            frames=frames,
-            proprioception=first["proprioception"].copy(),
-            previous_action=first["action"].copy(),
-            action=second["action"].copy(),
-            reward=second["reward"].copy(),
-            terminated=second["terminated"].astype(np.float32),
-            next_frames=next_frames,
-            next_proprioception=second["proprioception"].copy(),
-        )
+        minibatch = Minibatch.of_rows(first, second, frames, next_frames)
         return Gathered(minibatch, valid=self.not_overtaken(pairs))
 
 

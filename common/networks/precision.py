@@ -18,7 +18,7 @@ def wide_dtype(precision: Precision, device: torch.device, dtype: torch.dtype) -
     in ``dtype``, which keeps the losses within 1 % of those without bfloat16.
 
     Args:
-        precision: ``float32`` leaves everything in ``dtype``; ``auto`` takes bfloat16 where the processor
+        precision: ``float32`` leaves everything in ``dtype``; ``auto`` takes bfloat16 where the processor or GPU
             multiplies in it and ``dtype`` is float32.
         device: where the networks compute.
         dtype: format of the parameters.
@@ -26,6 +26,7 @@ def wide_dtype(precision: Precision, device: torch.device, dtype: torch.dtype) -
     if precision == "bfloat16":
         return torch.bfloat16
     if precision == "auto" and dtype == torch.float32:
-        has = torch.cuda.is_bf16_supported() if device.type == "cuda" else has_bfloat16()
+        # From Ampere on; torch would say that older GPUs can too, because it converts there and back.
+        has = torch.cuda.get_device_capability(device)[0] >= 8 if device.type == "cuda" else has_bfloat16()
         return torch.bfloat16 if has else dtype
     return dtype

@@ -27,16 +27,30 @@ __all__ = [
 ]
 
 
-def initial_policy(spec: TaskSpec, hidden_size: int, encoder_strides: Sequence[int], seed: int) -> Policy:
+def initial_policy(
+    spec: TaskSpec,
+    hidden_size: int,
+    encoder_strides: Sequence[int],
+    seed: int,
+    *,
+    zero_initialised_head: bool = True,
+) -> Policy:
     """Return version 0, the policy before any learning: N(0, 1) before the tanh, whatever the observation.
 
     Args:
         spec: the task.
         hidden_size: width of the hidden layers.
         encoder_strides: strides of the encoder's convolutions; unused without camera.
-        seed: of the random layers below the zero one.
+        seed: of the random layers; a learner with this seed starts with the same policy.
+        zero_initialised_head: False: another distribution, which depends on seed and observation.
     """
-    parameters = initial_parameters(spec, hidden_size, encoder_strides, np.random.default_rng(seed))
+    parameters = initial_parameters(
+        spec,
+        hidden_size,
+        encoder_strides,
+        np.random.default_rng(seed),
+        zero_initialised_head=zero_initialised_head,
+    )
     return _policy(spec, parameters, 0, encoder_strides)
 
 

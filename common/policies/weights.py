@@ -28,6 +28,7 @@ from common.errors import MessageError
 from common.messages import Float32Array, PolicyWeights, TaskSpec
 from common.networks.sizes import CHANNELS, FEATURES, KERNEL
 
+_HEAD_WEIGHT, _HEAD_BIAS = "actor.2.weight", "actor.2.bias"
 _WIRE_DTYPES: dict[str, np.dtype[Any]] = {"float32": np.dtype("<f4"), "float16": np.dtype("<f2")}
 
 
@@ -54,15 +55,28 @@ def parameter_shapes(spec: TaskSpec, hidden_size: int, encoder_strides: Sequence
 
 
 def initial_parameters(
-    spec: TaskSpec, hidden_size: int, encoder_strides: Sequence[int], rng: np.random.Generator
+    spec: TaskSpec,
+    hidden_size: int,
+    encoder_strides: Sequence[int],
+    rng: np.random.Generator,
+    *,
+    zero_initialised_head: bool = True,
 ) -> dict[str, Float32Array]:
-    """Return random layers under a zero one: N(0, 1) before the tanh, whatever the observation (thesis 4.2)."""
+    """Return random layers under a zero one: N(0, 1) before the tanh, whatever the observation (thesis 4.2).
+
+    Without ``zero_initialised_head``, the last layer is random as well, weight and bias uniform in
+    +-1 / sqrt(hidden_size), which is what ``torch.nn.Linear`` starts with; the layers below stay the same.
+    """
     parameters: dict[str, Float32Array] = {}
     for name, shape in parameter_shapes(spec, hidden_size, encoder_strides).items():
         parameters[name] = np.zeros(shape, np.float32)
-        if name.endswith("weight") and name != "actor.2.weight":
+        if name.endswith("weight") and name != _HEAD_WEIGHT:
             bound = 1.0 / math.sqrt(math.prod(shape[1:]))
             parameters[name] = rng.uniform(-bound, bound, shape).astype(np.float32)
+    if not zero_initialised_head:
+        bound = 1.0 / math.sqrt(hidden_size)
+        for name in (_HEAD_WEIGHT, _HEAD_BIAS):
+            parameters[name] = rng.uniform(-bound, bound, parameters[name].shape).astype(np.float32)
     parameters["log_std_bounds"] = np.array([-10.0, 10.0], np.float32)
     return parameters
 

@@ -33,7 +33,13 @@ def serve(service: Service, config: ActorConfig) -> None:
     algorithm = resolve_config(
         name, config.algorithm.preset or spec.algorithm_presets.get(name, ""), config.algorithm.overrides
     )
-    policy = initial_policy(spec, algorithm.hidden_size, algorithm.encoder_strides, config.run.seed)
+    policy = initial_policy(
+        spec,
+        algorithm.hidden_size,
+        algorithm.encoder_strides,
+        config.run.seed,
+        zero_initialised_head=algorithm.zero_initialised_head,
+    )
     actor = Actor(service, spec, policy, config.actor)
     if config.actor.real_time_priority and spec.pacing == "realtime":
         # Not before torch has been imported, which is seconds of computing.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from functools import partial
 from pathlib import Path
 
 from common import topics
@@ -22,29 +23,34 @@ def serve(service: Service, config: LearnerConfig) -> None:
     from common.algorithms import load_algorithm
     from common.algorithms.presets import resolve_config
     from common.cpu_tuning import tune_process
-    from common.frame_ring import RING_FILE
+    from common.frame_ring import RING_FILE, RingReader
     from services.learner.checkpoint import restore
+    from services.learner.device import open_device, too_little_memory_explained
+    from services.learner.device_frames import DeviceRingReader
     from services.learner.learner import Learner
     from services.learner.minibatches import MappedMinibatches, MinibatchSource, ReceivedMinibatches
 
     logger.info("%s", tune_process(settings.threads or None))
+    device = open_device(settings.device)
     algorithm_class = load_algorithm(name)
     spec = service.query_spec()
     if spec is None:
         return
     preset = config.algorithm.preset or spec.algorithm_presets.get(name, "")
     algorithm_config = resolve_config(name, preset, config.algorithm.overrides)
-    algorithm = algorithm_class(
-        spec, algorithm_config, seed=config.run.seed, device=settings.device, precision=settings.precision
-    )
     directory = Path(config.run.directory)
-    version = restore(directory, algorithm)
-    source: MinibatchSource
-    if settings.access == "map":
-        source = MappedMinibatches(service, spec, settings.prefetch, directory / RING_FILE)
-    else:
-        source = ReceivedMinibatches(service, spec, settings.prefetch)
-    Learner(service, algorithm, algorithm_config, settings, source, version).run()
+    with too_little_memory_explained(device):
+        algorithm = algorithm_class(
+            spec, algorithm_config, seed=config.run.seed, device=settings.device, precision=settings.precision
+        )
+        version = restore(directory, algorithm)
+        source: MinibatchSource
+        if settings.access == "map":
+            open_ring = partial(DeviceRingReader, device=device) if settings.frames_on_device else RingReader
+            source = MappedMinibatches(service, spec, settings.prefetch, directory / RING_FILE, open_ring)
+        else:
+            source = ReceivedMinibatches(service, spec, settings.prefetch)
+        Learner(service, algorithm, algorithm_config, settings, source, version).run()
 
 
 if __name__ == "__main__":

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from common.config import setting
+from common.errors import ConfigError
 from common.run_settings import AlgorithmSettings, RunSettings, TransportSettings
 
 
@@ -15,9 +17,12 @@ class LearnerSettings:
     access: str = setting("map", choices=("map", "arrays"))
     """How minibatches come; the same as replay's."""
     device: str = setting("cpu")
-    """Where updates run: a torch device."""
+    """Where updates run: ``cpu``, ``cuda``, or ``cuda:N`` for the GPU number N."""
     precision: str = setting("auto", choices=("auto", "float32", "bfloat16"))
-    """Of the convolutions and the wide layer; ``auto`` takes bfloat16 where the processor has it."""
+    """Of the convolutions and the wide layer; ``auto`` takes bfloat16 where the processor or the GPU has it."""
+    frames: str = setting("auto", choices=("auto", "host", "device"))
+    """Where the ring's frames are gathered from, with access ``map``: the mapped file, or a copy on the device, which
+    needs as much of its memory; ``auto`` is ``device`` on a GPU."""
     threads: int = setting(0, low=0, high=256)
     """Threads of an update; 0 leaves one core to the rest."""
     nice: int = setting(10, low=0, high=19)
@@ -26,6 +31,15 @@ class LearnerSettings:
     """Minibatches asked for ahead of need."""
     checkpoint_s: float = setting(30.0, low=1.0)
     """Period of the checkpoint that a restarted learner goes on from, seconds."""
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"cpu|cuda(:\d{1,2})?", self.device):
+            raise ConfigError(f"device = {self.device!r}: expected cpu, cuda or cuda:N, N a GPU's number")
+
+    @property
+    def frames_on_device(self) -> bool:
+        """True if minibatches are to be gathered from frames on the device."""
+        return self.frames == "device" or (self.frames == "auto" and self.device != "cpu")
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import logging
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -100,18 +100,25 @@ class MinibatchSource(ABC):
             for minibatch in self._collect():
                 with self._wake:
                     if minibatch is None:
-                        self.dropped += 1
+                        self.dropped += 1  # nothing that whoever waits for a minibatch need hear of
                     else:
                         self._ready.append(minibatch)
-                    self._wake.notify_all()
+                        self._wake.notify_all()
 
 
 class MappedMinibatches(MinibatchSource):
     """Row numbers come over the network, the data from the ring's file, read-only."""
 
-    def __init__(self, service: Service, spec: TaskSpec, prefetch: int, ring: Path) -> None:
+    def __init__(
+        self,
+        service: Service,
+        spec: TaskSpec,
+        prefetch: int,
+        ring: Path,
+        open_ring: Callable[[Path], RingReader] = RingReader,
+    ) -> None:
         super().__init__(service, spec, prefetch)
-        self._path = ring
+        self._path, self._open_ring = ring, open_ring
         self._ring: RingReader | None = None
         self._inbox = _inbox(service, topics.ROW_MINIBATCH, RowMinibatch, self._wake, spec)
 
@@ -125,7 +132,7 @@ class MappedMinibatches(MinibatchSource):
 
     def _gather(self, message: RowMinibatch) -> Minibatch | None:
         try:
-            ring = self._ring = self._ring or RingReader(self._path)
+            ring = self._ring = self._ring or self._open_ring(self._path)
         except RingError as error:
             self._service.refusals.refuse(topics.ROW_MINIBATCH.name, f"{error}; is replay on this computer?")
             return None

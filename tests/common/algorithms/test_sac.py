@@ -10,8 +10,10 @@ import torch
 
 from common.algorithms.presets import SACConfig
 from common.algorithms.sac import SAC
+from common.errors import ConfigError
 from common.minibatch import Minibatch
-from tests.reference.tasks import make_minibatch, make_spec
+from common.policies import initial_policy, policy_from_weights
+from tests.reference.tasks import make_minibatch, make_observation, make_spec
 
 CONFIG = SACConfig(batch_size=8, hidden_size=16, encoder_strides=(2, 2, 1, 1))
 SPEC = make_spec()
@@ -58,6 +60,25 @@ def test_the_temperature_falls_while_the_entropy_is_above_its_target_and_rises_b
 
 def test_the_default_target_entropy_is_minus_the_action_size():
     assert SAC(make_spec(action_size=3), CONFIG, seed=0).target_entropy == -3.0
+
+
+@pytest.mark.parametrize("zero_initialised_head", [True, False])
+@pytest.mark.parametrize("spec", [SPEC, make_spec((32, 36, 3))], ids=["no camera", "camera"])
+def test_learner_and_actor_begin_with_the_same_policy(spec, zero_initialised_head):
+    config = replace(CONFIG, zero_initialised_head=zero_initialised_head)
+    learners = policy_from_weights(spec, SAC(spec, config, seed=4).policy_weights(1, "float32"))
+    actors, other = (
+        initial_policy(spec, 16, config.encoder_strides, seed, zero_initialised_head=zero_initialised_head)
+        for seed in (4, 5)
+    )
+    observation = make_observation(spec, np.random.default_rng(0))
+    mine, theirs, others = (
+        policy.act(observation, np.random.default_rng(1), deterministic=True).action
+        for policy in (learners, actors, other)
+    )
+    np.testing.assert_array_equal(mine, theirs)
+    # A zero head makes all seeds' policies alike; a random one tells them apart.
+    assert np.array_equal(mine, others) == zero_initialised_head
 
 
 def test_targets_move_by_their_own_shares():
@@ -110,3 +131,35 @@ def test_networks_learn_the_value_of_a_two_step_task():
     batch = sac._batch(minibatch)
     q = sac.critic(batch.vector, batch.action).mean(dim=0)
     np.testing.assert_allclose(q.detach().numpy(), [-2.0, -1.0] * 4, atol=0.05)
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_frames_as_tensors_teach_the_same_to_the_last_bit(precision):
+    spec, rng = make_spec((32, 36, 3)), np.random.default_rng(0)
+    from_arrays, from_tensors = (SAC(spec, CONFIG, seed=0, precision=precision) for _ in range(2))
+    for _ in range(3):
+        minibatch = make_minibatch(spec, rng, 8)
+        from_arrays.update(minibatch)
+        tensors = {name: torch.tensor(getattr(minibatch, name)) for name in ("frames", "next_frames")}
+        from_tensors.update(replace(minibatch, **tensors))
+    expected, got = from_arrays.state_dict(), from_tensors.state_dict()
+    for name, value in expected.items():
+        np.testing.assert_array_equal(got[name], value, err_msg=name)
+
+
+def test_a_checkpoint_from_another_kind_of_device_is_gone_on_from_with_other_random_numbers():
+    original, resumed = SAC(SPEC, CONFIG, seed=0), SAC(SPEC, CONFIG, seed=1)
+    original.update(make_minibatch(SPEC, np.random.default_rng(0), 8))
+    state, own = original.state_dict(), resumed.state_dict()["random_state"]
+    gpus = np.arange(16, dtype=np.uint8)  # seed and offset, 8 bytes each
+    resumed.load_state_dict(state | {"random_state": gpus})
+    for name, value in resumed.state_dict().items():
+        np.testing.assert_array_equal(value, own if name == "random_state" else state[name], err_msg=name)
+    assert resumed.updates == 1
+
+
+@pytest.mark.parametrize("wrong", [np.zeros(0, np.uint8), np.zeros(16), np.zeros((2, 8), np.uint8)], ids=str)
+def test_a_random_state_that_is_none_is_refused(wrong):
+    sac = SAC(SPEC, CONFIG, seed=0)
+    with pytest.raises(ConfigError, match=r"random_state: expected \[5056\]"):
+        sac.load_state_dict(sac.state_dict() | {"random_state": wrong})

@@ -50,6 +50,20 @@ def test_shapes_are_those_of_the_thesis():
     assert "encoder.0.weight" not in parameter_shapes(make_spec(), 16, STRIDES)
 
 
+def test_only_the_head_differs_between_zero_and_default_initialisation():
+    zero = make_parameters()
+    default = initial_parameters(SPEC, 16, STRIDES, np.random.default_rng(0), zero_initialised_head=False)
+    assert list(default) == list(zero)
+    head = ("actor.2.weight", "actor.2.bias")
+    for name in zero.keys() - set(head):
+        np.testing.assert_array_equal(default[name], zero[name], err_msg=name)
+    for name in head:
+        assert not zero[name].any()
+        # torch.nn.Linear: uniform in +-1 / sqrt(16).
+        assert 0.15 < np.abs(default[name]).max() <= 0.25
+        assert len(np.unique(default[name])) == default[name].size
+
+
 def test_float32_arrives_to_the_last_bit_through_the_codec():
     parameters = make_parameters()
     arrived = unpack_weights(decode(encode(make_weights()), PolicyWeights), SHAPES)

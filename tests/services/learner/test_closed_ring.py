@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import torch
 
 from common import topics
 from common.algorithms.presets import resolve_config
@@ -20,6 +21,7 @@ from common.transport import InMemoryNetwork
 from services.actor.actor import Actor
 from services.actor.config import ActorSettings
 from services.learner.config import LearnerSettings
+from services.learner.device_frames import DeviceRingReader
 from services.learner.learner import Learner
 from services.learner.minibatches import MappedMinibatches, ReceivedMinibatches
 from services.replay.config import ReplaySettings
@@ -82,6 +84,7 @@ def run_ring(
     task=None,
     algorithm=None,
     access="map",
+    frames="host",
     pacing="lockstep",
     drops=None,
     order=topics.SERVICES,
@@ -97,7 +100,8 @@ def run_ring(
     sac = KeepingSAC(spec, config, seed=0, precision="float32")
     policy = initial_policy(spec, config.hidden_size, config.encoder_strides, 0)
     source = MappedMinibatches if access == "map" else ReceivedMinibatches
-    extra = [directory / RING_FILE] if access == "map" else []
+    open_ring = partial(DeviceRingReader, device=torch.device("cpu")) if frames == "device" else RingReader
+    extra = [directory / RING_FILE, open_ring] if access == "map" else []
     make = {
         topics.ROBOT_BRIDGE: partial(
             RobotBridge, task=world, settings=RobotBridgeSettings(steps=steps, pacing=pacing), totals=Totals()
@@ -189,7 +193,7 @@ def assert_what_was_learnt_from_is_what_was_seen(ring):
     sampled = 0
     for minibatch in ring.algorithm.minibatches:
         for i in range(len(minibatch.reward)):
-            key = carried_ids(minibatch.frames[i]), carried_ids(minibatch.next_frames[i])
+            key = carried_ids(np.asarray(minibatch.frames[i])), carried_ids(np.asarray(minibatch.next_frames[i]))
             assert key in published
             a, b = published[key]
             np.testing.assert_array_equal(minibatch.proprioception[i], a.proprioception)
@@ -201,8 +205,8 @@ def assert_what_was_learnt_from_is_what_was_seen(ring):
     assert sampled >= 100
 
 
-@pytest.mark.parametrize("access", ["map", "arrays"])
-def test_camera_frames_go_round_the_ring(tmp_path, access):
+@pytest.mark.parametrize(("access", "frames"), [("map", "host"), ("map", "device"), ("arrays", "host")])
+def test_camera_frames_go_round_the_ring(tmp_path, access, frames):
     ring = run_ring(
         tmp_path,
         "noise_frames",
@@ -210,6 +214,7 @@ def test_camera_frames_go_round_the_ring(tmp_path, access):
         task=TINY_FRAMES,
         algorithm={**TINY_ENCODER, "replay_ratio": 0.25},
         access=access,
+        frames=frames,
     )
     assert ring.bridge.counters()["steps"] == 200
     assert_nothing_lost_nothing_twice(ring)

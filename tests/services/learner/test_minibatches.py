@@ -1,15 +1,18 @@
 """Minibatches come by credit, in order, once; from the mapped ring or as arrays."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+import torch
 
 from common import topics
 from common.clock import FakeClock
 from common.frame_ring import RING_FILE, RingReader, RingWriter, array_minibatch
 from common.messages import RowMinibatch
 from common.transport import InMemoryNetwork
+from services.learner.device_frames import DeviceRingReader
 from services.learner.minibatches import MappedMinibatches, ReceivedMinibatches
 from tests.common.ring_cases import HEIGHT, MARGIN_X, MARGIN_Y, STACK, WIDTH, Bridge, task_spec
 from tests.helpers import TIMEOUT_S, eventually
@@ -24,14 +27,14 @@ CAPACITY = 40
 class Scene:
     """A source of minibatches, and the replay that serves it, with a ring of its own."""
 
-    def __init__(self, directory, source_class) -> None:
+    def __init__(self, directory, source_class, open_ring=RingReader) -> None:
         self.clock = FakeClock()
         self.network = InMemoryNetwork()
         self.service = SoloService(topics.LEARNER, self.network, directory, self.clock, incarnation=LEARNER)
         self.path, self.bridge = directory / RING_FILE, Bridge()
         self.peer = Peer(self.network)
         self.credits = self.peer.messages(topics.CREDIT)
-        extra = [self.path] if source_class is MappedMinibatches else []
+        extra = [self.path, open_ring] if source_class is MappedMinibatches else []
         self.source = source_class(self.service, task_spec(), PREFETCH, *extra)
         self.ring = None
 
@@ -61,8 +64,8 @@ class Scene:
         )
 
 
-def started(directory, source_class):
-    scene = Scene(directory, source_class)
+def started(directory, source_class, *open_ring):
+    scene = Scene(directory, source_class, *open_ring)
     scene.source.start()
     yield scene
     scene.source.stop()
@@ -70,10 +73,12 @@ def started(directory, source_class):
         scene.ring.close()
 
 
-@pytest.fixture
-def mapped(tmp_path):
+@pytest.fixture(params=["frames in the ring", "frames on the device"])
+def mapped(tmp_path, request):
     """A source that maps the ring."""
-    yield from started(tmp_path, MappedMinibatches)
+    on_device = request.param == "frames on the device"
+    open_ring = partial(DeviceRingReader, device=torch.device("cpu")) if on_device else RingReader
+    yield from started(tmp_path, MappedMinibatches, open_ring)
 
 
 @pytest.fixture
