@@ -76,7 +76,7 @@ packages_up_to_date() {
 # An editable installation is the repository's path, the metadata of pyproject.toml, and the start-up file.
 distribution_source() {
     pwd
-    cat pyproject.toml "$bootstrap"/*.pth
+    cat pyproject.toml "$bootstrap"/relod_gymnasium.*
 }
 
 distribution_up_to_date() {
