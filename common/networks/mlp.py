@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from common.networks.product import batched_linear, linear
+
 
 class Actor(nn.ModuleList):
     """Observation vector -> mean and unbounded log standard deviation.
@@ -34,7 +36,7 @@ class Actor(nn.ModuleList):
         first, hidden, last = self
         assert isinstance(hidden, nn.Linear)
         x = functional.relu_(first(vector)).to(self._wide)
-        x = functional.relu_(functional.linear(x, hidden.weight.to(self._wide), hidden.bias.to(self._wide)))
+        x = functional.relu_(linear(x, hidden.weight.to(self._wide), hidden.bias.to(self._wide)))
         mean, log_std = last(x.to(vector.dtype)).chunk(2, dim=1)
         return mean, log_std
 
@@ -72,10 +74,11 @@ class TwinQ(nn.Module):
         self.weight1, self.bias1 = layer(hidden_size, hidden_size)
         self.weight2, self.bias2 = layer(hidden_size, 1)
 
-    def forward(self, vector: Tensor, action: Tensor) -> Tensor:
-        """(B, vector), (B, A) -> (2, B)."""
+    def forward(self, vector: Tensor, action: Tensor, *, frozen: bool = False) -> Tensor:
+        """(B, vector), (B, A) -> (2, B); if ``frozen``, the gradient reaches the arguments, not the parameters."""
+        parameters = (self.weight0, self.bias0, self.weight1, self.bias1, self.weight2, self.bias2)
+        weight0, bias0, weight1, bias1, weight2, bias2 = (p.detach() if frozen else p for p in parameters)
         inputs = torch.cat([vector, action], dim=1).expand(2, -1, -1)
-        x = functional.relu_(torch.baddbmm(self.bias0, inputs, self.weight0)).to(self._wide)
-        weight, bias = self.weight1.to(self._wide), self.bias1.to(self._wide)
-        x = functional.relu_(torch.baddbmm(bias, x, weight)).to(vector.dtype)
-        return torch.baddbmm(self.bias2, x, self.weight2).squeeze(2)
+        x = functional.relu_(torch.baddbmm(bias0, inputs, weight0)).to(self._wide)
+        x = functional.relu_(batched_linear(x, weight1.to(self._wide), bias1.to(self._wide))).to(vector.dtype)
+        return torch.baddbmm(bias2, x, weight2).squeeze(2)

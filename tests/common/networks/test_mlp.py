@@ -50,3 +50,16 @@ def test_a_bfloat16_hidden_layer_changes_values_little_and_gradients_stay_float3
     torch.testing.assert_close(values, full(vector, action), atol=5e-3, rtol=0.0)
     gradients = torch.autograd.grad(values.sum(), list(half.parameters()))
     assert {gradient.dtype for gradient in gradients} == {torch.float32}
+
+
+def test_frozen_critics_pass_the_gradient_to_the_action_and_keep_none():
+    critics, vector = make_critics(), torch.randn(5, 4)
+    action = torch.randn(5, 3, requires_grad=True)
+    values, frozen = critics(vector, action), critics(vector, action, frozen=True)
+    torch.testing.assert_close(frozen, values)
+    torch.testing.assert_close(torch.autograd.grad(frozen.sum(), action), torch.autograd.grad(values.sum(), action))
+    # A leaf that is reached by nothing has no gradient at all.
+    reached = torch.autograd.grad(
+        critics(vector, action, frozen=True).sum(), [action, *critics.parameters()], allow_unused=True
+    )
+    assert [gradient is not None for gradient in reached] == [True, *[False] * 6]
