@@ -1,0 +1,122 @@
+"""``python -m experiments.hits --task T``: how often does the initial policy reach the goal, under each time limit?
+
+The question before any learning (thesis 6.2, 7.3; figures 7.2 and 8.4): tanh of N(0, 1) acts for 20 000 steps, resets
+included, and the target hits are counted. ``DIR`` then holds ``hits.csv``, ``hits.png`` and what is needed to go on:
+the same command finishes an interrupted grid, and more tasks, limits or seeds are added to what is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from common.errors import RelodError
+from common.record import write_atomically
+from deploy.console import Console
+from deploy.stop_signals import INTERRUPTED, StopSignals
+from experiments.grid import GridRecord, key_text, run_grid
+from experiments.target_hits.choice import (
+    TaskChoice,
+    add_options,
+    check_count,
+    check_limits,
+    choose_task,
+    record_settings,
+)
+from experiments.target_hits.counting import STEPS
+from experiments.target_hits.figure import draw_hits
+from experiments.target_hits.jobs import all_keys, hit_counts, relative_cost, work
+from experiments.target_hits.table import cells, csv_text, table_text
+from experiments.workers import JobFailure, WorkerPool
+
+SEEDS = 30
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Count from the command line; return the exit code."""
+    options = _parser().parse_args(arguments)
+    console = Console()
+    try:
+        limits = check_limits(options.limits)
+        seeds = range(check_count("--seeds", options.seeds))
+        steps = check_count("--steps", options.steps)
+        workers = check_count("--workers", options.workers)
+        choices = [choose_task(name, options.preset, options.set) for name in dict.fromkeys(options.task)]
+        with StopSignals() as stop:
+            settings = record_settings(choices, steps=steps)
+            keys = all_keys((choice.name for choice in choices), limits, seeds)
+            with (
+                GridRecord(Path(options.out), settings) as record,
+                WorkerPool(work, settings, workers) as pool,
+            ):
+                console.line(_beginning(choices, record, len(keys), sum(key in record.rows for key in keys)))
+                failures = run_grid(
+                    record,
+                    keys,
+                    pool,
+                    progress=lambda progress: console.status(str(progress)),
+                    failed=lambda failure: console.error(_failure_text(failure)),
+                    asked_to_stop=lambda: stop.asked,
+                    cost=relative_cost(settings),
+                )
+                write_results(record, steps, console)
+        if stop.asked:
+            console.line("interrupted: the same command goes on from here")
+            return INTERRUPTED
+        if failures:
+            console.error(
+                f"{len(failures)} of {len(keys)} jobs failed (tracebacks: {record.directory / 'failures.log'}); "
+                "the same command tries them again"
+            )
+        return 1 if failures else 0
+    except RelodError as error:
+        console.error(f"experiments.hits: error: {error}")
+    except OSError as error:
+        console.error(f"experiments.hits: error: {error.filename or 'system'}: {error.strerror}")
+    return 1
+
+
+def write_results(record: GridRecord, steps: int, console: Console) -> None:
+    """Write and show what the record has so far."""
+    counts = hit_counts(record.rows)
+    if not counts:
+        return
+    path = record.directory / "hits.csv"
+    write_atomically(path, csv_text(counts))
+    summary = cells(counts)
+    draw_hits(record.directory / "hits.png", summary, steps, show_sufficient=steps == STEPS)
+    console.line(table_text(summary, steps))
+    console.line(f"\n{path}, {record.directory / 'hits.png'}")
+
+
+def _beginning(choices: Sequence[TaskChoice], record: GridRecord, jobs: int, finished: int) -> str:
+    tasks = ", ".join(f"{choice.name} ({choice.preset})" for choice in choices)
+    there = f", {finished} of them in {record.directory} already" if finished else ""
+    return f"{tasks}: {jobs} jobs{there}"
+
+
+def _failure_text(failure: JobFailure) -> str:
+    return f"{key_text(failure.key)} failed: {failure.reason}; the rest goes on"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.hits",
+        description="Count how often the initial policy reaches the goal under each time limit.",
+        epilog="example: python -m experiments.hits --task dot_reacher --limits 10 50 500 --seeds 10 --out runs/dot",
+    )
+    parser.add_argument(
+        "--task", nargs="+", required=True, metavar="T", help="task ids, or id=module:Class for a task of your own"
+    )
+    parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help="for each limit (default: %(default)s)")
+    parser.add_argument(
+        "--steps", type=int, default=STEPS, metavar="N", help="in which hits are counted (default: %(default)s)"
+    )
+    add_options(parser, "runs/hits")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,155 @@
+"""Which tasks are looked at, with which settings, from the command line."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+from common.config import parse_override
+from common.errors import ConfigError
+from services.robot_bridge.tasks import Task, load_task
+
+LIMITS = (1, 2, 5, 10, 25, 50, 100, 500, 1000, 5000)
+"""Time limits of figures 7.2 and 8.4, steps."""
+PREFERRED_PRESET = "thesis"
+"""Taken where a task has it and nobody asks for another: its numbers can be compared with the thesis's."""
+
+_SECTION = "task"
+_DECIDES_WORLDS = ("numpy", "mujoco", "dm-control")
+"""Packages whose next version may draw or simulate differently."""
+
+
+@dataclass(frozen=True)
+class TaskChoice:
+    """A task, ready to be built in any process."""
+
+    name: str
+    preset: str
+    overrides: Mapping[str, Any]
+    rows: Mapping[str, str] = field(default_factory=dict)
+    """More rows for the table of tasks."""
+
+    def build(self, rng: np.random.Generator) -> Task:
+        """Build the task in lockstep; ``rng`` is all of its randomness."""
+        return load_task(self.name, self.preset, self.overrides, self.rows, pacing="lockstep", rng=rng)
+
+
+def choose_task(name: str, preset: str | None = None, overrides: Sequence[str] = ()) -> TaskChoice:
+    """Check a choice by building the task once.
+
+    Args:
+        name: task id, or ``id=module:Class`` for a task that is not in the table.
+        preset: of the task; None takes :data:`PREFERRED_PRESET`, or the task's default.
+        overrides: ``task.key=value``.
+
+    Raises:
+        ConfigError: unknown task, preset or setting, or a task without goal.
+    """
+    task_id, equals, target = name.partition("=")
+    rows = {task_id: target} if equals else {}
+    values: dict[str, Any] = {}
+    for override in overrides:
+        section, key, value = parse_override(override)
+        if section != _SECTION:
+            raise ConfigError(f"--set {override}: only settings of the task count here: expected task.key=value")
+        if key == "time_limit":
+            raise ConfigError(f"--set {override}: the time limits to try are given by --limits")
+        values[key] = value
+    rng = np.random.default_rng(0)
+    if preset is None:
+        presets = load_task(task_id, rows=rows, rng=rng).PRESETS
+        preset = PREFERRED_PRESET if PREFERRED_PRESET in presets else ""
+    task = load_task(task_id, preset, values, rows, rng=rng)
+    task.close()
+    if not task.spec.has_goal:
+        raise ConfigError(
+            f"--task {task_id}: it has no goal to hit, its attempts end at the time limit only; "
+            "target hits and the guideline are for minimum-time tasks, whose attempts end where the goal is reached"
+        )
+    return TaskChoice(task_id, task.spec.preset, values, rows)
+
+
+def record_settings(choices: Sequence[TaskChoice], **counted: int) -> dict[str, Any]:
+    """What the numbers of a grid of these tasks depend on, as plain values.
+
+    Args:
+        choices: the tasks.
+        counted: settings of the jobs: ``steps`` to count hits in, ``effort`` of a search.
+    """
+    settings: dict[str, Any] = {
+        **counted,
+        "versions": {name: metadata.version(name) for name in _DECIDES_WORLDS},
+    }
+    for choice in choices:
+        spec = choice.build(np.random.default_rng(0)).spec
+        settings[f"task {choice.name}"] = {
+            "preset": choice.preset,
+            "overrides": dict(choice.overrides),
+            "rows": dict(choice.rows),
+            "reset_steps": spec.reset_steps,
+            "action_low": spec.action_low.tolist(),
+            "action_high": spec.action_high.tolist(),
+        }
+    return settings
+
+
+def choice_from(settings: Mapping[str, Any], task: str) -> TaskChoice:
+    """The choice of ``task`` that :func:`record_settings` has written down."""
+    values = settings[f"task {task}"]
+    return TaskChoice(task, values["preset"], values["overrides"], values["rows"])
+
+
+def add_options(parser: argparse.ArgumentParser, out: str) -> None:
+    """Add the options that both tools have."""
+    parser.add_argument(
+        "--limits",
+        type=int,
+        nargs="+",
+        default=list(LIMITS),
+        metavar="N",
+        help="time limits, steps (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--preset", metavar="NAME", help=f"of the task (default: {PREFERRED_PRESET} where there is one)"
+    )
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="task.KEY=VALUE", help="change a setting of the task"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=usable_cores(), metavar="N", help="processes (default: one a core, %(default)s)"
+    )
+    parser.add_argument("--out", default=out, metavar="DIR", help="folder of the results (default: %(default)s)")
+
+
+def check_limits(limits: Sequence[int]) -> tuple[int, ...]:
+    """The limits, ascending, each once.
+
+    Raises:
+        ConfigError: one is no number of steps.
+    """
+    for limit in limits:
+        if limit < 1:
+            raise ConfigError(f"--limits {limit}: expected at least 1 step")
+    return tuple(sorted(set(limits)))
+
+
+def check_count(option: str, value: int) -> int:
+    """``value``, if there can be so many.
+
+    Raises:
+        ConfigError: there cannot.
+    """
+    if value < 1:
+        raise ConfigError(f"{option} {value}: expected at least 1")
+    return value
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0))
