@@ -1,0 +1,133 @@
+"""``python -m experiments.minimum_time``: what learning makes of several time limits, and whether hits foretell it.
+
+Trains every task of a study under its time limits with several seeds, counts the hits of the initial policies, and
+writes tables, figures and a README. What is finished is kept: the same command goes on where it was interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from common.errors import ConfigError, RelodError
+from deploy.console import Console
+from deploy.stop_signals import INTERRUPTED, StopSignals
+from experiments.grid import GridRecord, Row, duration_text, run_grid
+from experiments.minimum_time.figures import draw_figures
+from experiments.minimum_time.folders import RESULTS, keep_crashed, remove_half_finished, runs_folder
+from experiments.minimum_time.jobs import work
+from experiments.minimum_time.plan import Plan
+from experiments.minimum_time.report import table_text, write_report
+from experiments.minimum_time.results import collect
+from experiments.minimum_time.sizes import SIZES, Size
+from experiments.minimum_time.tables import write_tables
+from experiments.target_hits.choice import usable_cores
+from experiments.workers import JobFailure, Key, Work, WorkerPool
+
+_NAME = "experiments.minimum_time"
+
+
+def run_study(plan: Plan, out: Path, workers: int, console: Console, do: Work = work) -> int:
+    """Run what is not finished, write the results of all that is; return the exit code."""
+    runs, settings = runs_folder(out), plan.settings()
+    failures: dict[Key, str] = {}
+
+    def report_failure(failure: JobFailure) -> None:
+        job = plan.jobs[failure.key]
+        failures[failure.key] = f"crashed: {failure.reason}"
+        kept = keep_crashed(runs, job)
+        console.error(
+            f"{_NAME}: {job.folder} crashed: {failure.reason}; the rest goes on; "
+            f"traceback: {runs / 'failures.log'}" + (f"; its record: {kept}" if kept else "")
+        )
+
+    with StopSignals() as stop, GridRecord(runs, settings) as record:
+        for name in remove_half_finished(runs, plan.jobs.values(), record.rows):
+            console.line(f"{name} was interrupted: removed, it begins again")
+        console.line(f"{_finished(plan, record)} of {len(plan.jobs)} jobs are finished; results go to {out}")
+        with WorkerPool(do, {**settings, "runs": str(runs)}, workers) as pool:
+            run_grid(
+                record,
+                list(plan.jobs),
+                pool,
+                progress=lambda progress: console.status(str(progress)),
+                failed=report_failure,
+                asked_to_stop=lambda: stop.asked,
+                cost=lambda key: plan.expected_s(plan.jobs[key]),
+            )
+        write_results(plan.size, record.rows, failures, out, console)
+        if failures:
+            console.error(
+                f"{_NAME}: {len(failures)} of {len(plan.jobs)} jobs crashed and are missing in the results; "
+                "the same command tries them again"
+            )
+        if stop.asked:
+            console.line(
+                f"interrupted: {_finished(plan, record)} of {len(plan.jobs)} jobs are kept; the same command goes on"
+            )
+            return INTERRUPTED
+    return 1 if failures else 0
+
+
+def write_results(
+    size: Size, rows: Mapping[Key, Row], failures: Mapping[Key, str], out: Path, console: Console
+) -> None:
+    """Write tables, figures and README of the finished jobs, and show the tables."""
+    study = collect(size, rows, failures)
+    if not any(curve.runs for curve in study.curves):
+        return
+    paths = write_tables(out, study)
+    figures = draw_figures(out, study)
+    paths += [*figures, write_report(out, study, f"python -m {_NAME} --size {size.name}", figures)]
+    console.line(table_text(study))
+    console.line(f"training took {duration_text(sum(row.get('core_s', 0.0) for row in rows.values()))} of one core")
+    for path in paths:
+        console.line(str(path))
+
+
+def _finished(plan: Plan, record: GridRecord) -> int:
+    return sum(key in record.rows for key in plan.jobs)
+
+
+def main(arguments: Sequence[str] | None = None, sizes: Mapping[str, Size] = SIZES, do: Work = work) -> int:
+    """Run a study from the command line; return the exit code.
+
+    Args:
+        arguments: of the command line.
+        sizes: name -> study; the first is the default.
+        do: does a job.
+    """
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {_NAME}",
+        description="Learning curves under several time limits, and what the initial policy's hits foretell of them.",
+    )
+    parser.add_argument("--size", choices=sizes, default=next(iter(sizes)), help="of the study (default: %(default)s)")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="of the results (default: experiments/minimum_time/results/SIZE)"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=usable_cores(), metavar="N", help="processes (default: one a core, %(default)s)"
+    )
+    parser.add_argument("--plan", action="store_true", help="say what would be run and how long it takes; run nothing")
+    options = parser.parse_args(arguments)
+    console = Console()
+    out: Path = options.out or RESULTS / options.size
+    try:
+        if options.workers < 1:
+            raise ConfigError(f"--workers {options.workers}: expected at least 1")
+        plan = Plan(sizes[options.size])
+        if options.plan:
+            console.line(plan.text(options.workers))
+            return 0
+        return run_study(plan, out.absolute(), options.workers, console, do)
+    except RelodError as error:
+        console.error(f"{_NAME}: error: {error}")
+    except OSError as error:
+        console.error(f"{_NAME}: error: {error.filename or out}: {error.strerror}")
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
