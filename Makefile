@@ -7,13 +7,14 @@ STEPS = $(if $(filter dot_reacher,$(TASK)),5000,7000)
 MODE = local_only
 NETWORK =
 RUN_DIR =
+SIZE = small
 PYTHON =
 
 python = .venv/bin/python
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test test-stable-baselines3 check soak format environment lock clean
+.PHONY: help demo test test-stable-baselines3 check bench soak study-min-time format environment lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-23s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -38,8 +39,14 @@ test-stable-baselines3: ## train a stock learner on a task through Gymnasium, in
 	@PYTHON='$(PYTHON)' deploy/bootstrap/environment.sh sync .venv-sb3 tests/stable_baselines3/requirements.lock
 	.venv-sb3/bin/python tests/stable_baselines3/train.py
 
+bench: environment ## measure every speed and size that has a budget; fail if one is exceeded
+	$(python) -m benchmarks.bench
+
 soak: environment ## run for 21 minutes; fail if memory or open files grow
 	$(python) -m benchmarks.soak
+
+study-min-time: environment ## learn under several time limits; resumable; SIZE=small (within an hour) or thesis
+	$(python) -m experiments.minimum_time --size $(SIZE)
 
 format: environment ## format the code and fix what the linter can
 	$(python) -m ruff check --fix --exit-zero .

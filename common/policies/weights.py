@@ -102,7 +102,7 @@ def pack_weights(
         MessageError: a parameter is not finite, or too large for ``dtype``.
     """
     wire = _wire_dtype(dtype)
-    flat = np.concatenate([np.ravel(values) for values in parameters.values()])
+    flat = np.concatenate([np.ravel(values) for values in parameters.values()], dtype=np.float32)
     with np.errstate(over="ignore"):
         buffer = flat.astype(wire).view(np.uint8)
     if not np.isfinite(buffer.view(wire)).all():
