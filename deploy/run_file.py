@@ -19,6 +19,9 @@ from common.record import write_atomically
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
+IN_PROCESS = "in_process"
+"""Mode of a run without processes, network and real time (``experiments.train``)."""
+
 _DISTRIBUTIONS = (
     "dm-control",
     "eclipse-zenoh",

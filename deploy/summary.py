@@ -23,7 +23,7 @@ from deploy.curve import draw_learning_curve
 from deploy.episodes import Episode, EpisodeTable, steps_per_goal
 from deploy.network import NetworkPart
 from deploy.parts import RunParts
-from deploy.run_file import RunFile
+from deploy.run_file import IN_PROCESS, RunFile
 from deploy.summary_text import summary_text
 from deploy.traffic import bytes_per_key, network_link
 
@@ -160,7 +160,7 @@ def summarise(record: Record) -> Summary:
         "updates": _count(parts.greatest(LEARNER, "updates")),
         "policy_pushes": _count(parts.total(LEARNER, "policy_pushes")),
         "policy_version": _count(parts.greatest(LEARNER, "policy_version")),
-        "observation_to_action_ms": record.actions.observation_to_action_ms() if record.actions else None,
+        "observation_to_action_ms": _observation_to_action_ms(record),
         "outages": _outages(record, notes),
         "bytes_per_key": bytes_per_key(parts.bytes_sent()),
         "wall_s": run_parts.elapsed_s(parts),
@@ -198,6 +198,12 @@ def _steps_per_goal(
         notes.append("steps_per_goal_last_1000 is null: no goal was reached in the last 1000 steps")
         return None
     return round(value, 3)
+
+
+def _observation_to_action_ms(record: Record) -> dict[str, float] | None:
+    if record.actions is None or (record.run is not None and record.run.mode == IN_PROCESS):
+        return None  # in simulated time, an answer takes as long as it is told to
+    return record.actions.observation_to_action_ms()
 
 
 def _outages(record: Record, notes: list[str]) -> list[dict[str, float | None]] | None:

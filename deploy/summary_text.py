@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from deploy.run_file import IN_PROCESS
+
 _LABEL_WIDTH = 11
 
 
@@ -13,8 +15,8 @@ def summary_text(values: Mapping[str, Any]) -> str:
     rows = [
         ("run", _run(values)),
         ("steps", _steps(values)),
-        ("real time", _real_time(values)),
-        ("answers", _answers(values)),
+        # In simulated time there are no overruns and no latencies to report.
+        *([] if values["mode"] == IN_PROCESS else [("real time", _real_time(values)), ("answers", _answers(values))]),
         ("experience", _experience(values)),
         ("learning", _learning(values)),
         ("network", _network(values)),

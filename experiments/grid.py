@@ -56,6 +56,7 @@ class GridRecord:
         self.directory = directory
         self.rows: dict[Key, Row] = {}
         """Every finished job there is, also those of earlier calls."""
+        _refuse_foreign(directory)
         directory.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as stack:
             lock = stack.enter_context((directory / ".lock").open("w"))
@@ -126,6 +127,18 @@ class GridRecord:
                 path = self.directory / "results.jsonl"
                 raise GridError(f"{path}, line {number} cannot be understood: {error!r}; delete the line") from error
             self.rows[key] = row
+
+
+def _refuse_foreign(directory: Path) -> None:
+    """Raise GridError if the folder holds something, but not a grid's record."""
+    if not directory.is_dir():
+        return
+    names = {path.name for path in directory.iterdir()} - {".lock"}
+    if names and not names & {"settings.json", "results.jsonl"}:
+        raise GridError(
+            f"{directory} holds other files ({', '.join(sorted(names)[:3])}): expected an empty folder, or one with "
+            "results of this program"
+        )
 
 
 @dataclass(frozen=True)

@@ -143,7 +143,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise ConfigError(f"--seed {options.seed}: expected at least 0")
         choice = choose_task(options.task, options.preset, options.set)
         thoroughness = Thoroughness()
-        settings = record_settings([choice], steps=STEPS, effort=check_count("--effort", options.effort))
+        effort = check_count("--effort", options.effort)
+        if effort < max(limits):
+            raise ConfigError(
+                f"--effort {effort}: expected at least the longest of the limits, {max(limits)} steps: "
+                "a shorter search cannot tell whether the goal can be reached within it"
+            )
+        settings = record_settings([choice], steps=STEPS, effort=effort)
         with (
             StopSignals() as stop,
             GridRecord(Path(options.out), settings) as record,

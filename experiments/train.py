@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import logging
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -35,7 +36,7 @@ from deploy.options import NO_NETWORK, default_run_name, make_run_id
 from deploy.placement import load_placement
 from deploy.plan import PORTS, PortMap, RunRequest, plan_run
 from deploy.progress import ProgressReader, progress_line
-from deploy.run_file import RunFile, versions
+from deploy.run_file import IN_PROCESS, RunFile, versions
 from deploy.stop_signals import INTERRUPTED, StopSignals
 from deploy.summary import read_record, summarise, write_curve, write_summary
 from deploy.summary_text import summary_text
@@ -43,8 +44,6 @@ from experiments.simulation import SimulatedClock, SimulatedNetwork
 
 logger = logging.getLogger(__name__)
 
-MODE = "in_process"
-"""What ``run.toml`` and the summary name as the mode."""
 _PROGRESS_S = 1.0
 _LOOK_S = 1.0
 """Simulated time between two looks at what is going on."""
@@ -81,6 +80,7 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
     run_dir = training.run_dir
     if run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
         raise ConfigError(f"--run-dir {run_dir}: expected a folder that is empty or not there yet")
+    is_new = not run_dir.exists()
     configurations = _configurations(training)
     _write_configurations(training, configurations)
     steps = configurations[ROBOT_BRIDGE].robot_bridge.steps
@@ -95,8 +95,16 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
         if stop and stop.asked:
             simulation.stop("interrupted")
 
-    with _log_to(run_dir / "logs" / "train.log"):
-        _Simulation(configurations).run(look)
+    log = run_dir / "logs" / "train.log"
+    try:
+        with _log_to(log):
+            _Simulation(configurations).run(look)
+    except ConfigError:
+        if is_new:  # Nothing has begun: the corrected command may use the same folder.
+            shutil.rmtree(run_dir, ignore_errors=True)
+        raise
+    except RelodError as error:
+        raise ServiceError(f"{error}; see {log}. python -m deploy.summary {run_dir} shows what there is") from error
     summary = summarise(read_record(run_dir))
     paths = [write_summary(run_dir, summary), write_curve(run_dir, summary)]
     if console:
@@ -223,7 +231,7 @@ def _write_configurations(training: Training, configurations: Mapping[str, Any])
         write_atomically(training.run_dir / "config" / f"{service}.toml", tomli_w.dumps(to_tables(configuration)))
     RunFile(
         id=bridge.run.id,
-        mode=MODE,
+        mode=IN_PROCESS,
         task=bridge.task.name,
         algorithm=configurations[LEARNER].algorithm.name,
         seed=bridge.run.seed,
@@ -271,7 +279,7 @@ def _parse(arguments: Sequence[str] | None) -> Training:
         help="override a setting, as for deploy.launch; may be given several times",
     )
     options = parser.parse_args(arguments)
-    run_dir = options.run_dir or Path("runs") / default_run_name(MODE, options.task, options.seed, datetime.now())
+    run_dir = options.run_dir or Path("runs") / default_run_name(IN_PROCESS, options.task, options.seed, datetime.now())
     return Training(options.task, run_dir, options.algorithm, options.seed, options.steps, tuple(options.set))
 
 

@@ -89,8 +89,12 @@ def _minimum(facts: TaskFacts, evidence: Evidence) -> str:
         return "not looked for, since no limit has enough hits."
     how = (
         f"a search tried plans of commands from {searched} random starts, up to {facts.effort} steps each, and found a "
-        f"way to the goal from {found} of them. What it finds is possible; the true minimum can only be less."
+        f"way to the goal from {found} of them."
     )
+    if found:
+        how += " What it finds is possible; the true minimum can only be less."
+    else:
+        how += " That it found none proves nothing; with a larger --effort it looks longer."
     steps = evidence.minimum_steps
     if steps is None:
         return f"not known; {how}"
@@ -178,7 +182,17 @@ def _why_too_short(evidence: Evidence, verdict: Verdict) -> list[str]:
     short = [limit for limit, finding in verdict.findings.items() if finding.length is Side.BELOW]
     enough = [limit for limit in short if verdict.findings[limit].hits is not Side.BELOW]
     long = [limit for limit in verdict.findings if limit not in short]
-    sentences = [f"the limits with enough hits ({_list(enough)}) are too short. {_why_short(evidence, short)}"]
+    if not enough:
+        minimum = evidence.minimum_steps
+        assert minimum is not None
+        return [
+            f"all limits that were tried are below the minimum steps ({minimum}), and hits under them say nothing "
+            "about longer ones: give longer ones with --limits."
+        ]
+    sentences = [
+        f"the limits with enough hits ({_list(enough)}) are too short. {_why_short(evidence, short)}",
+        "That is as far as the search can tell; with a larger --effort it looks longer for a way.",
+    ]
     if long:
         sentences.append(f"{_list(long)} {_have(long)} too few hits. Try limits in between with --limits.")
     else:

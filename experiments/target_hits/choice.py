@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
+import inspect
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -84,11 +87,13 @@ def record_settings(choices: Sequence[TaskChoice], **counted: int) -> dict[str, 
     """
     settings: dict[str, Any] = {
         **counted,
-        "versions": {name: metadata.version(name) for name in _DECIDES_WORLDS},
+        "versions": {name: _version(name) for name in _DECIDES_WORLDS},
     }
     for choice in choices:
-        spec = choice.build(np.random.default_rng(0)).spec
+        task = choice.build(np.random.default_rng(0))
+        spec = task.spec
         settings[f"task {choice.name}"] = {
+            "source": _source_digest(type(task)),
             "preset": choice.preset,
             "overrides": dict(choice.overrides),
             "rows": dict(choice.rows),
@@ -97,6 +102,20 @@ def record_settings(choices: Sequence[TaskChoice], **counted: int) -> dict[str, 
             "action_high": spec.action_high.tolist(),
         }
     return settings
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:  # not every task needs each of them
+        return "not installed"
+
+
+def _source_digest(task_class: type[Task]) -> str:
+    """Of the files that define a task: counts of an edited task must not be mixed with those before."""
+    files = {inspect.getsourcefile(cls) for cls in task_class.__mro__ if issubclass(cls, Task)}
+    contents = [Path(file).read_bytes() for file in sorted(filter(None, files))]
+    return hashlib.blake2b(b"".join(contents), digest_size=8).hexdigest()
 
 
 def choice_from(settings: Mapping[str, Any], task: str) -> TaskChoice:

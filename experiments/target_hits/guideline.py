@@ -110,7 +110,7 @@ class Answer(Enum):
     BORDERLINE = "borderline"
     """There may be one, and no reasonable effort can tell."""
     TOO_SHORT = "too short"
-    """Limits with enough hits are too short, longer ones have too few."""
+    """Limits with enough hits are too short, longer ones have too few; or all that were tried are too short."""
     DO_NOT_TRY = "do not try"
     """No limit has enough hits."""
 
@@ -187,7 +187,10 @@ def judge(evidence: Evidence, thoroughness: Thoroughness) -> Verdict:
     if admissible is not None:
         return Verdict(Answer.USE, admissible, open_limits, findings)
     if all(finding.hits is Side.BELOW for finding in findings.values()):
-        return Verdict(Answer.DO_NOT_TRY, None, (), findings)
+        # Under limits that are all too short, few hits say nothing about longer ones.
+        longest_needed = evidence.minimum_steps
+        too_short = longest_needed is not None and max(findings) < longest_needed
+        return Verdict(Answer.TOO_SHORT if too_short else Answer.DO_NOT_TRY, None, (), findings)
     if open_limits:
         return Verdict(Answer.BORDERLINE, _most_promising(evidence, open_limits), open_limits, findings)
     return Verdict(Answer.TOO_SHORT, None, (), findings)

@@ -142,6 +142,10 @@ class TaskEnv(Env[Observation, Float32Array]):
         info = self._info(self._ledger, is_success=outcome.terminated)
         return self._observe(self._ledger), float(outcome.reward), outcome.terminated, truncated, info
 
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        # A simulator's world and its views of it would come apart, without a word.
+        raise TypeError(f"{self.task_spec.task}: an environment cannot be copied or pickled: make another one")
+
     def render(self) -> UInt8Array | None:
         """Return the newest camera frame, (H, W, C); None without ``render_mode`` or before the first reset."""
         if self.render_mode is None or self._newest_frame is None:
@@ -168,14 +172,14 @@ class TaskEnv(Env[Observation, Float32Array]):
     def _physical(self, action: Any) -> Float32Array:
         shape = self.task_spec.action_low.shape
         try:
-            unit = np.asarray(action, np.float32)
+            unit = np.asarray(action, np.float64)
         except (TypeError, ValueError) as error:
             raise InvalidAction(f"{self.task_spec.task}: expected numbers of shape {shape}, got {action!r}") from error
         if unit.shape != shape:
             raise InvalidAction(f"{self.task_spec.task}: expected an action of shape {shape}, got shape {unit.shape}")
         if not np.isfinite(unit).all():
             raise InvalidAction(f"{self.task_spec.task}: expected finite numbers in [-1, 1], got {unit}")
-        physical = self._action_range.to_physical(unit)
+        physical = self._action_range.to_physical(np.clip(unit, -1.0, 1.0).astype(np.float32))
         clipped: Float32Array = np.clip(physical, self.task_spec.action_low, self.task_spec.action_high)
         return clipped
 

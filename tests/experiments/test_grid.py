@@ -125,3 +125,10 @@ def test_progress_counts_jobs_of_this_call_and_judges_the_time_by_cost(tmp_path)
 )
 def test_durations_are_read_at_a_glance(seconds, text):
     assert duration_text(seconds) == text
+
+
+def test_a_folder_with_other_files_is_left_alone(tmp_path):
+    (tmp_path / "hits.csv").write_text("mine")
+    with pytest.raises(GridError, match=r"holds other files \(hits.csv\)"), GridRecord(tmp_path, SETTINGS):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["hits.csv"]

@@ -107,6 +107,7 @@ def test_a_stop_ends_the_run_early_with_a_whole_record(tmp_path):
 def test_what_cannot_be_trained_is_refused_with_the_reason(changes, message, tmp_path):
     with pytest.raises(ConfigError, match=message):
         train(small(tmp_path / "run", **changes))
+    assert not (tmp_path / "run").exists(), "the corrected command may use the same folder"
 
 
 def test_a_service_that_fails_ends_the_run_with_its_reason(tmp_path, monkeypatch):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +27,20 @@ QUICK_LEARNING = (
 )
 
 
-def launch(run_dir: Path, *arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
+@contextlib.contextmanager
+def launch(run_dir: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
         [sys.executable, "-m", "deploy.launch", *arguments, "--run-dir", str(run_dir)],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-    )
+    ) as process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:  # the test has failed: its run must not go on for ever
+                process.send_signal(signal.SIGINT)
 
 
 def run(run_dir: Path, *arguments: str) -> dict[str, Any]:
@@ -87,7 +95,7 @@ def test_ctrl_c_ends_everything_and_completes_the_record(when: str, tmp_path: Pa
         if when != "at once":
             wait_until(lambda: read_parts(run_dir, "robot_bridge"), "the bridge has started")
         if when == "while acting":
-            wait_until(lambda: read_parts(run_dir, "robot_bridge")[-1]["counters"]["steps"] > 50, "steps are done")
+            wait_until(lambda: steps(run_dir) > 50, "steps are done")
         pressed = time.monotonic()
         process.send_signal(signal.SIGINT)
         output, _ = process.communicate(timeout=60)

@@ -138,3 +138,10 @@ def test_both_may_be_needed():
 def test_a_hopeless_task_is_searched_a_little_to_tell_why():
     assert look({10: (0,) * 5}, ()) == NextLook(starts=True)
     assert look({10: (0,) * 5}, starts((10, None))) == NextLook()
+
+
+def test_few_hits_under_limits_that_are_all_too_short_are_no_reason_not_to_try():
+    found = verdict({1: around(3), 2: around(4)})
+    assert (found.answer, found.limit) == (Answer.TOO_SHORT, None)
+    # Where one of them is long enough, they are.
+    assert verdict({1: around(3), 8: around(4)}).answer is Answer.DO_NOT_TRY

@@ -1,7 +1,9 @@
 """Tasks through Gymnasium's interface: what its own checker wants, and what minimum-time tasks add to it."""
 
+import copy
 import functools
 import os
+import pickle
 import subprocess
 import sys
 
@@ -403,3 +405,17 @@ def test_a_closed_task_is_let_go_once_and_does_nothing_more(scripted):
     for call in (interface.reset, lambda: interface.step(CENTRE)):
         with pytest.raises(ClosedEnvironmentError, match="is closed; make a new one"):
             call()
+
+
+def test_a_large_action_is_clipped_and_an_infinite_one_refused():
+    interface = make("relod/DotReacher-v0")
+    interface.reset(seed=0)
+    interface.step(np.array([1e300, -1e300]))
+    with pytest.raises(InvalidAction, match="finite"):
+        interface.step(np.array([np.inf, 0.0]))
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_a_copy_is_refused_rather_than_made_of_half_a_world(copied):
+    with pytest.raises(TypeError, match="cannot be copied or pickled: make another one"):
+        copied(make("relod/ReacherEasy-v0"))
