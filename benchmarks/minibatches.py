@@ -30,6 +30,7 @@ from common.minibatch import Minibatch
 from deploy.ports import reserved_ports
 
 BATCH_SIZE = 256
+MESSAGE_BYTES = 100_000_000
 PREFETCH = 2
 """Minibatches asked for ahead of need, as the learner's default."""
 FIRST_S, NEXT_S = 20.0, 30.0
@@ -168,7 +169,7 @@ def sender(resources: ExitStack, *, ring: str, port: int) -> Prepared:
             asked.get()
             rows = sampler.sample(reader, BATCH_SIZE)
             assert rows is not None
-            for part in array_minibatch(reader, rows, 0, ordinal):
+            for part in array_minibatch(reader, rows, 0, ordinal, max_bytes=MESSAGE_BYTES):
                 publisher.put(encode(part))
 
     threading.Thread(target=answer, daemon=True).start()

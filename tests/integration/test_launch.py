@@ -29,6 +29,8 @@ QUICK_LEARNING = (
 
 @contextlib.contextmanager
 def launch(run_dir: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    # Tests that run in the background of a script ignore SIGINT, and so would the launcher until it has a handler.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with subprocess.Popen(
         [sys.executable, "-m", "deploy.launch", *arguments, "--run-dir", str(run_dir)],
         cwd=ROOT,

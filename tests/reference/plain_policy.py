@@ -1,7 +1,8 @@
 """Acting written as plainly as torch allows: what the policies of :mod:`common.policies` are compared with.
 
-The whole network in torch, float images in NCHW, distributions from ``torch.distributions``. It computes the same
-action and the same log-probability, from the same parameters.
+The whole network in torch, float images in NCHW, distributions from ``torch.distributions``; the network that is
+trained acts, and its result is detached. It computes the same action and the same log-probability, from the same
+parameters.
 """
 
 from __future__ import annotations
@@ -30,7 +31,6 @@ class PlainPolicy:
         self._load(((f"{i}.{n}", p) for i, layer in layers for n, p in layer.named_parameters()), parameters, "actor")
         self.log_std_low, self.log_std_high = parameters["log_std_bounds"].tolist()
 
-    @torch.no_grad()
     def act(self, observation, deterministic=False):
         """Return (action, log-probability), physical units."""
         spec = self.spec
@@ -51,11 +51,11 @@ class PlainPolicy:
         std = torch.exp(low + (high - low) * (torch.tanh(log_std) + 1) / 2)
         squash = TanhTransform(cache_size=1)
         distribution = TransformedDistribution(Normal(mean, std), [squash])
-        unit_action = squash(mean) if deterministic else distribution.sample()
+        unit_action = squash(mean) if deterministic else distribution.rsample()
         log_probability = distribution.log_prob(unit_action).sum().item()
         action_low, action_high = torch.as_tensor(spec.action_low), torch.as_tensor(spec.action_high)
         action = action_low + (unit_action[0] + 1) / 2 * (action_high - action_low)
-        return action.numpy(), log_probability
+        return action.detach().numpy(), log_probability
 
     @staticmethod
     def _load(named, parameters, prefix):
