@@ -53,6 +53,11 @@ if behaviour == "cannot start":
     counters["steps"] = 0
 print(f"{name} says hello", flush=True)
 write_part("running")
+if behaviour in ("fail", "crash") and name != "robot_bridge":
+    # In the middle of a run: whoever fails before the bridge has made a step has failed to start.
+    patience_s = time.monotonic() + 10.0
+    while time.monotonic() < patience_s and not list(run_dir.glob("parts/robot_bridge-*.json")):
+        time.sleep(0.01)
 if behaviour in ("fail", "cannot start"):
     write_part("stopped", failure="the disk is full")
     sys.exit(3)
