@@ -56,6 +56,8 @@ class Topic:
     """How often, for the reader."""
     urgent: bool = False
     """Sent ahead of everything else on its lane."""
+    waits: bool = False
+    """Large: a put waits for the network, so the publisher has a thread of its own for it."""
 
     def key(self, run: str, robot: str) -> str:
         """Full key expression in a run."""
@@ -78,8 +80,10 @@ EXPERIENCE_HEAD = Topic("experience/head", m.StreamHead, (ACTOR,), (REPLAY,), _N
 EXPERIENCE_ACK = Topic("experience/ack", m.Acknowledgement, (REPLAY,), (ACTOR,), _NEWEST, _REAL_TIME, "0.1 s")
 CREDIT = Topic("credit", m.Credit, (LEARNER,), (REPLAY,), _NEWEST, _REAL_TIME, "update, 0.2 s")
 ROW_MINIBATCH = Topic("minibatch/rows", m.RowMinibatch, (REPLAY,), (LEARNER,), _NUMBERED, _BULK, "update")
-ARRAY_MINIBATCH = Topic("minibatch/arrays", m.ArrayMinibatch, (REPLAY,), (LEARNER,), _NUMBERED, _BULK, "update")
-POLICY = Topic("policy", m.PolicyWeights, (LEARNER,), (ACTOR,), _CACHED, _BULK, "push interval")
+ARRAY_MINIBATCH = Topic(
+    "minibatch/arrays", m.ArrayMinibatch, (REPLAY,), (LEARNER,), _NUMBERED, _BULK, "update", waits=True
+)
+POLICY = Topic("policy", m.PolicyWeights, (LEARNER,), (ACTOR,), _CACHED, _BULK, "push interval", waits=True)
 STATUS = Topic("status", m.Status, SERVICES, SERVICES, _NEWEST, _REAL_TIME, "0.2 s")
 FINISHED = Topic("finished", m.Finished, (ROBOT_BRIDGE,), (ACTOR, REPLAY, LEARNER), _NEWEST, _REAL_TIME, "end, 0.2 s")
 # fmt: on

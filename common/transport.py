@@ -3,7 +3,7 @@
 This is the only file that imports zenoh. Both transports pass the same conformance tests. Rules for users:
 
 * callbacks run on a receiving thread: they enqueue and return, nothing else (a slow one stalls every priority);
-* ``put`` never waits for the network, except on a ``CACHED`` topic, which wants a thread of its own;
+* ``put`` never waits for the network, except on a topic that ``waits``, which wants a thread of its own;
 * ``put`` on a closed transport is a :class:`~common.errors.TransportError`;
 * a query that nobody answers returns None, at the latest after its time-out.
 """
@@ -114,7 +114,7 @@ class ZenohTransport:
         else:
             publisher = session.declare_publisher(
                 key,
-                congestion_control=zenoh.CongestionControl.DROP,
+                congestion_control=zenoh.CongestionControl.BLOCK if topic.waits else zenoh.CongestionControl.DROP,
                 priority=zenoh.Priority.REAL_TIME if topic.urgent else zenoh.Priority.DATA,
                 express=topic.urgent,
             )

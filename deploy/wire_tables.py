@@ -22,6 +22,7 @@ import common.service
 import common.transport
 import services.actor.forwarding
 import services.learner.minibatches
+import services.replay.minibatch_senders
 import services.replay.replay
 import services.robot_bridge.answers
 import services.robot_bridge.bridge
@@ -77,7 +78,7 @@ CONSTANTS = (
     (common.journal, "MAX_RANGES"),
     (services.actor.forwarding, "ACKNOWLEDGE_S"),
     (services.replay.replay, "ACKNOWLEDGE_S"),
-    (services.replay.replay, "LOST_AFTER_S"),
+    (services.replay.minibatch_senders, "LOST_AFTER_S"),
     (services.replay.replay, "ACTOR_LOST_AFTER_S"),
     (services.learner.minibatches, "CREDIT_S"),
     (services.robot_bridge.answers, "REMEMBERED_STEPS"),
@@ -159,6 +160,8 @@ def _quality_of_service(topic: Topic) -> str:
             return "query"
         case Delivery.CACHED:
             return "`DATA_LOW` `BLOCK`"
+    if topic.waits:
+        return "`DATA` `BLOCK`"
     return "`REAL_TIME` `DROP` express" if topic.urgent else "`DATA` `DROP`"
 
 

@@ -19,20 +19,19 @@ from common import topics
 from common.algorithms.presets import SACConfig
 from common.codec import encode
 from common.errors import MessageError
-from common.frame_ring import RING_FILE, RingWriter, array_minibatch
+from common.frame_ring import RING_FILE, RingWriter
 from common.inbox import Inbox
 from common.journal import OrderedReceiver
-from common.messages import Credit, Experience, RowMinibatch, StreamHead, TaskSpec
+from common.messages import Credit, Experience, StreamHead, TaskSpec
 from common.service import Service
 from services.replay.config import ReplaySettings
+from services.replay.minibatch_senders import ArraySender, MinibatchSender, RowSender
 from services.replay.sampler import TransitionSampler, UpdateBudget
 
 logger = logging.getLogger(__name__)
 
 ACKNOWLEDGE_S = 0.1
 """Period of the acknowledgement to the actor."""
-LOST_AFTER_S = {"map": 1.0, "arrays": 15.0}
-"""A minibatch that the learner still misses after this long is taken for lost on the way; arrays may be slow."""
 ACTOR_LOST_AFTER_S = 5.0
 """At the end, what an actor still owes is waited for this long: it may be behind a network outage."""
 
@@ -62,13 +61,14 @@ class Replay:
         # In lockstep the actor goes by what is owed: it must not hear of it a hundred steps later.
         self._ack_period_ns = 0 if spec.pacing == "lockstep" else round(ACKNOWLEDGE_S * 1e9)
         self._next_ack_ns = 0
-        self._maps = settings.access == "map"
-        self._minibatches = service.transport.publisher(topics.ROW_MINIBATCH if self._maps else topics.ARRAY_MINIBATCH)
+        self._minibatches: MinibatchSender = (
+            RowSender(service)
+            if settings.access == "map"
+            else ArraySender(service, self._ring, round(settings.message_mib * 2**20))
+        )
         self._credit = Credit(0, 0, 0)
         self._sent = 0
-        self._sent_ns = 0
         self._paid = 0
-        self._lost_after_ns = round(LOST_AFTER_S[settings.access] * 1e9)
         self._sent_total = 0
         self._produced_seen: dict[int, int] = {}
         self._copies_refused = 0
@@ -90,6 +90,7 @@ class Replay:
                 self.step()
             service.drain(self._is_drained, self._keep)
         finally:
+            self._minibatches.stop()
             self._ring.close()
 
     def step(self) -> None:
@@ -181,26 +182,17 @@ class Replay:
         if credit.learner_incarnation > self._credit.learner_incarnation:
             logger.info("a learner has joined")
             self._sent = self._paid = credit.received_total
-        elif credit.received_total < self._sent and self._service.clock.now_ns() - self._sent_ns > self._lost_after_ns:
+            self._minibatches.forget()
+        elif credit.received_total < self._sent and self._minibatches.quiet_s() > self._minibatches.lost_after_s:
             self._sent = credit.received_total
         self._credit = credit
 
     def _send_minibatch(self) -> bool:
         rows = self._sampler.sample(self._ring, self._batch_size)
-        if rows is None:
+        if rows is None or not self._minibatches.send(rows, self._credit.learner_incarnation, self._sent):
             return False
-        learner = self._credit.learner_incarnation
-        if self._maps:
-            self._minibatches.put(encode(RowMinibatch(learner, self._sent, rows)))
-        else:
-            parts = array_minibatch(self._ring, rows, learner, self._sent, int(self._settings.message_mib * 2**20))
-            if not parts:
-                return False
-            for part in parts:
-                self._minibatches.put(encode(part))
         self._sent += 1
         self._sent_total += 1
-        self._sent_ns = self._service.clock.now_ns()
         return True
 
     def _is_drained(self) -> bool:

@@ -137,6 +137,17 @@ def test_a_large_message_arrives_whole_or_not_at_all(mesh, topic):
     assert ears.payloads == [large]
 
 
+@pytest.mark.parametrize("topic", [topics.ARRAY_MINIBATCH, topics.POLICY], ids=lambda topic: topic.name)
+def test_a_put_that_waits_gets_every_large_message_through(mesh, topic):
+    here, there = mesh.join(), mesh.join()
+    ears, publisher = Ears(there, topic), here.publisher(topic)
+    tell(publisher, b"begin", ears)
+    sizes = [16 * 2**20 + i for i in range(6)]
+    for size in sizes:
+        publisher.put(bytes(size))
+    eventually(lambda: [len(payload) for payload in ears.payloads] == [5, *sizes], "every message, once and in order")
+
+
 def test_both_directions_work_whoever_connected(mesh):
     first, second = mesh.join(), mesh.join()
     for sender, receiver in ((first, second), (second, first)):

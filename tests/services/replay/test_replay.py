@@ -314,6 +314,55 @@ def test_minibatches_as_arrays_are_those_of_the_ring(tmp_path):
             np.testing.assert_array_equal(getattr(minibatch, name)[i], getattr(ring, name)[at])
 
 
+class SlowLink:
+    """Keeps whoever puts an array minibatch waiting until the test opens it."""
+
+    def __init__(self, scene) -> None:
+        self.open = threading.Event()
+        self.reached = threading.Event()
+        scene.peer.transport.subscribe(topics.ARRAY_MINIBATCH, self._carry)
+
+    def _carry(self, payload) -> None:
+        self.reached.set()
+        assert self.open.wait(TIMEOUT_S)
+
+
+def test_a_slow_link_keeps_only_the_minibatches_waiting(tmp_path):
+    scene = Scene(tmp_path, access="arrays")
+    link = SlowLink(scene)
+    bridge = Bridge()
+    scene.send(*attempt(bridge, 60))
+    scene.ask(3)
+    assert link.reached.wait(TIMEOUT_S)
+    scene.send(*(bridge.step() for _ in range(40)))
+    assert scene.ack().next_seq == 100
+    scene.clock.advance(100.0)
+    scene.ask(3)
+    assert scene.counter("minibatches") == 3  # those on their way are not taken for lost
+    link.open.set()
+    assert [p.ordinal for p in scene.arrays.wait_for(3)] == [0, 1, 2]
+
+    def sent_again():
+        scene.clock.advance(1.0)
+        scene.ask(3, received_total=2)
+        return len(scene.arrays) > 3
+
+    eventually(sent_again, "the last minibatch once more")
+    assert [p.ordinal for p in scene.arrays] == [0, 1, 2, 2]
+
+
+def test_what_waits_for_a_learner_that_is_gone_is_dropped(tmp_path):
+    scene = Scene(tmp_path, access="arrays")
+    link = SlowLink(scene)
+    scene.send(*attempt(Bridge(), 60))
+    scene.ask(4)
+    assert link.reached.wait(TIMEOUT_S)
+    scene.ask(1, learner=LEARNER + 1)
+    link.open.set()
+    parts = scene.arrays.wait_for(2)
+    assert [(p.learner_incarnation, p.ordinal) for p in parts] == [(LEARNER, 0), (LEARNER + 1, 0)]
+
+
 # ---------------------------------------------------------------------- restarts
 
 
