@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 import reprlib
+import sys
 import types
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import cache
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -28,6 +29,7 @@ Sizes = dict[str, int]
 Decoder = Callable[[Any, str, Sizes], Any]
 
 _UNBOUNDED = Bounds()
+_LARGEST = sys.float_info.max
 _shown = reprlib.repr
 """Text of what came, short enough for a log whatever it is."""
 _BY_NAME = {message.__name__: message for message in MESSAGES}
@@ -35,8 +37,8 @@ _BY_NAME = {message.__name__: message for message in MESSAGES}
 
 def encode(message: Any) -> bytes:
     """Return the payload of a message of :data:`common.messages.MESSAGES`."""
-    values = {"schema": SCHEMA_VERSION, "message": type(message).__name__, **_plain_fields(message)}
-    packed = msgpack.packb(values, use_bin_type=True)
+    values = {"schema": SCHEMA_VERSION, "message": type(message).__name__, **vars(message)}
+    packed = msgpack.packb(values, default=_plain, use_bin_type=True)
     assert isinstance(packed, bytes)
     return packed
 
@@ -75,38 +77,59 @@ def decode(payload: bytes, expected: type[Message], dimensions: Dimensions | Non
     return decoded
 
 
-def _plain_fields(message: Any) -> dict[str, Any]:
-    return {f.name: _plain(getattr(message, f.name)) for f in fields(message)}
-
-
 def _plain(value: Any) -> Any:
+    """Return what msgpack packs instead of something it does not know."""
     if isinstance(value, np.ndarray):
         contiguous = np.ascontiguousarray(value)
         return [value.dtype.str, list(value.shape), contiguous.data if contiguous.size else b""]
-    if isinstance(value, StrEnum):
-        return value.value
     if isinstance(value, np.generic):
         return value.item()
-    if is_dataclass(value):
-        return _plain_fields(value)
-    return value
+    return vars(value)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """How to decode one message type. Looked up once per message, so that little code runs on a cold processor."""
+
+    names: frozenset[str]
+    numbers: tuple[tuple[str, Any, float, float, Bounds], ...]
+    """Name, type, finite inclusive bounds to compare with at once, and the declared ones."""
+    others: tuple[tuple[str, Decoder], ...]
 
 
 @cache
-def _decoders(cls: Any) -> tuple[tuple[str, Decoder], ...]:
+def _plan(cls: Any) -> _Plan:
     hints = get_type_hints(cls, include_extras=True)
-    return tuple((f.name, _decoder(hints[f.name])) for f in fields(cls))
+    numbers: list[tuple[str, Any, float, float, Bounds]] = []
+    others: list[tuple[str, Decoder]] = []
+    for item in fields(cls):
+        hint, bounds = hints[item.name], _UNBOUNDED
+        if get_origin(hint) is Annotated and isinstance(get_args(hint)[1], Bounds):
+            hint, bounds = get_args(hint)
+        if hint in (int, float):
+            low = -_LARGEST if bounds.low is None else bounds.low
+            high = _LARGEST if bounds.high is None else bounds.high
+            numbers.append((item.name, hint, low, high, bounds))
+        else:
+            others.append((item.name, _decoder(hint)))
+    return _Plan(frozenset(hints), tuple(numbers), tuple(others))
 
 
 def _decode_dataclass(cls: Any, values: Any, where: str, sizes: Sizes) -> Any:
     if not isinstance(values, dict):
         raise MessageError(f"{where}: expected a map, got {type(values).__name__}")
-    decoders = _decoders(cls)
-    if len(values) != len(decoders) or any(name not in values for name, _ in decoders):
-        names = {name for name, _ in decoders}
-        missing, unknown = sorted(names - values.keys()), sorted(map(str, values.keys() - names))
+    plan = _plan(cls)
+    if values.keys() != plan.names:
+        missing, unknown = sorted(plan.names - values.keys()), sorted(map(str, values.keys() - plan.names))
         raise MessageError(f"{where}: missing fields {missing}, unknown fields {_shown(unknown)}")
-    return cls(**{name: decoder(values[name], f"{where}.{name}", sizes) for name, decoder in decoders})
+    for name, kind, low, high, bounds in plan.numbers:
+        value = values[name]
+        # Not a number is not within any bounds either.
+        if type(value) is not kind or not low <= value <= high:
+            values[name] = _number(kind, value, f"{where}.{name}", bounds)
+    for name, decoder in plan.others:
+        values[name] = decoder(values[name], f"{where}.{name}", sizes)
+    return cls(**values)
 
 
 def _decoder(hint: Any, bounds: Bounds = _UNBOUNDED) -> Decoder:
@@ -175,10 +198,11 @@ def _array_decoder(dtype: np.dtype[Any], shape: tuple[str | int, ...]) -> Decode
         sent_dtype, sent_shape, raw = value
         if sent_dtype != dtype.str:
             raise MessageError(f"{where}: expected dtype {dtype.str}, got {_shown(sent_dtype)}")
-        valid = isinstance(sent_shape, list) and all(type(n) is int and n >= 0 for n in sent_shape)
-        if not valid or len(sent_shape) != len(shape):
+        if not isinstance(sent_shape, list) or len(sent_shape) != len(shape):
             raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {_shown(sent_shape)}")
         for letter, size in zip(shape, sent_shape, strict=True):
+            if type(size) is not int or size < 0:
+                raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {_shown(sent_shape)}")
             wanted = letter if isinstance(letter, int) else sizes.setdefault(letter, size)
             if size != wanted:
                 raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {sent_shape}")

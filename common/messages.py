@@ -345,7 +345,7 @@ class PolicyWeights:
     buffer: Annotated[UInt8Array, Array("uint8", ("m",))]
     """Little-endian values of all parameters, concatenated."""
     digest: str
-    """BLAKE2b-128 of the buffer, hexadecimal."""
+    """XXH3-128 of the buffer, seed 0, hexadecimal."""
 
 
 @dataclass(frozen=True)

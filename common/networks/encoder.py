@@ -50,18 +50,42 @@ class Encoder(nn.ModuleList):
 
     def forward(self, frames: Tensor) -> Tensor:
         """(B, h, w, S * C) uint8 -> (B, 64) in [-1, 1]."""
-        # NHWC bytes seen as NCHW are what torch calls channels_last, the layout its convolutions are fastest in.
-        maps = frames.permute(0, 3, 1, 2).to(self._wide)
+        layers = []
         for i, convolution in enumerate(self):
             assert isinstance(convolution, nn.Conv2d)
-            # Pixels count from 0 to 1: dividing the kernels is cheaper than dividing the images, and 0..255 is
-            # exact in bfloat16.
-            weight = convolution.weight / 255.0 if i == 0 else convolution.weight
+            kernel = for_bytes(convolution.weight) if i == 0 else convolution.weight
             bias = None if convolution.bias is None else convolution.bias.to(self._wide)
-            maps = functional.conv2d(maps, weight.to(self._wide), bias, convolution.stride)
-            if i < len(self) - 1:
-                maps = functional.relu_(maps)
-        return spatial_softmax(maps.to(self.positions.dtype), self.positions)
+            layers.append((kernel.to(self._wide), bias, convolution.stride[0]))
+        return encode_frames(frames, layers, self.positions)
+
+
+Layer = tuple[Tensor, Tensor | None, int]
+"""Kernel, bias and stride of a convolution."""
+
+
+def for_bytes(kernel: Tensor) -> Tensor:
+    """Return the first kernel for pixels from 0 to 255; the trained one expects them from 0 to 1.
+
+    Dividing the kernel is cheaper than dividing the images, and 0..255 is exact in bfloat16.
+    """
+    return kernel / 255.0
+
+
+def encode_frames(frames: Tensor, layers: Sequence[Layer], positions: Tensor) -> Tensor:
+    """Return what :class:`Encoder` does, for its convolutions in the number format to compute in.
+
+    Args:
+        frames: (B, h, w, S * C) uint8.
+        layers: the convolutions, the first :func:`for_bytes`.
+        positions: see :func:`map_positions`; the features have its number format.
+    """
+    # NHWC bytes seen as NCHW are what torch calls channels_last, the layout its convolutions are fastest in.
+    maps = frames.permute(0, 3, 1, 2).to(layers[0][0].dtype)
+    for i, (kernel, bias, stride) in enumerate(layers):
+        maps = functional.conv2d(maps, kernel, bias, stride)
+        if i < len(layers) - 1:
+            maps = functional.relu_(maps)
+    return spatial_softmax(maps.to(positions.dtype), positions)
 
 
 def map_positions(rows: int, columns: int) -> Tensor:

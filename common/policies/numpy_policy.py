@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+from math import exp, log, log1p, pi, sqrt, tanh
 
 import numpy as np
 
@@ -11,8 +11,9 @@ from common.messages import Float32Array, TaskSpec
 from common.policies.base import ChosenAction, Observation
 from common.policies.unit_range import UnitRange, action_range
 
-_LOG_SQRT_2_PI = 0.5 * math.log(2.0 * math.pi)
-_LOG_2 = math.log(2.0)
+_LOG_2 = log(2.0)
+_LOG_DENSITY_OFFSET = log(sqrt(2.0 * pi)) + 2.0 * _LOG_2
+"""What is subtracted from the log-density of each dimension whatever the draw."""
 
 
 class NumpyActor:
@@ -25,7 +26,7 @@ class NumpyActor:
         self._first = (np.asfortranarray(layers[0][0]), layers[0][1])
         self._hidden, self._head = layers[1:]
         low, high = parameters["log_std_bounds"].tolist()
-        self._log_std_bounds = (float(low), float(high))
+        self._log_std_range = (low + high) / 2.0, (high - low) / 2.0
         self._actions = action_range(spec)
         self._vector = UnitRange(
             np.concatenate([spec.proprioception_low, spec.action_low]),
@@ -50,7 +51,7 @@ class NumpyActor:
         weight, bias = self._head
         head = weight.dot(hidden)
         head += bias
-        return choose(head, self._log_std_bounds, self._actions, rng, deterministic)
+        return choose(head, self._log_std_range, self._actions, rng, deterministic)
 
 
 class NumpyPolicy:
@@ -68,7 +69,7 @@ class NumpyPolicy:
 
 def choose(
     head: Float32Array,
-    log_std_bounds: tuple[float, float],
+    log_std_range: tuple[float, float],
     actions: UnitRange,
     rng: np.random.Generator,
     deterministic: bool,
@@ -77,7 +78,7 @@ def choose(
 
     Args:
         head: (2 A,), mean and unbounded log standard deviation.
-        log_std_bounds: what tanh of the second half is mapped to.
+        log_std_range: centre and half width of what tanh of the second half is mapped to.
         actions: the task's action bounds.
         rng: source of the noise; untouched if ``deterministic``.
         deterministic: take the mean.
@@ -86,14 +87,14 @@ def choose(
     size = len(head) // 2
     values: list[float] = head.tolist()
     noise = [0.0] * size if deterministic else rng.standard_normal(size, np.float32).tolist()
-    low, high = log_std_bounds
+    centre, half = log_std_range
     unit, log_probability = [], 0.0
     for mean, unbounded_log_std, draw in zip(values[:size], values[size:], noise, strict=True):
-        log_std = low + 0.5 * (high - low) * (math.tanh(unbounded_log_std) + 1.0)
-        before_tanh = mean + math.exp(log_std) * draw
+        log_std = centre + half * tanh(unbounded_log_std)
+        before_tanh = mean + exp(log_std) * draw
         # log(1 - tanh(u)^2) = 2 (log 2 - |u| - log(1 + e^(-2 |u|))): the left side is -inf from |u| = 19 on.
         magnitude = abs(before_tanh)
-        log_slope = 2.0 * (_LOG_2 - magnitude - math.log1p(math.exp(-2.0 * magnitude)))
-        log_probability -= 0.5 * draw * draw + log_std + _LOG_SQRT_2_PI + log_slope
-        unit.append(math.tanh(before_tanh))
+        slope = 2.0 * (magnitude + log1p(exp(-2.0 * magnitude)))
+        log_probability += slope - 0.5 * draw * draw - log_std - _LOG_DENSITY_OFFSET
+        unit.append(tanh(before_tanh))
     return ChosenAction(actions.to_physical(np.array(unit, np.float32)), log_probability)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from common.messages import Float32Array, TaskSpec, UInt8Array
-from common.networks.encoder import Encoder
-from common.networks.sizes import cropped_shape
+from common.networks.encoder import Layer, encode_frames, for_bytes, map_positions
+from common.networks.sizes import cropped_shape, map_size
 from common.policies.base import ChosenAction, Observation
 from common.policies.numpy_policy import NumpyActor
 
@@ -26,18 +28,11 @@ class TorchPolicy:
     ) -> None:
         """Take over ``parameters``, named and shaped as in :mod:`common.policies.weights`."""
         self.version = version
-        self._height, self._width, channels = cropped_shape(spec)
+        self._height, self._width, _ = cropped_shape(spec)
         self._top, self._left = (int(n) for n in spec.crop_margin)
-        # Not in bfloat16: for a single observation converting the kernels costs more than it saves.
-        dtype = torch.float32
-        self._encoder = Encoder(self._height, self._width, channels, encoder_strides, dtype=dtype, wide=dtype)
-        self._encoder.load_state_dict(
-            {
-                name.removeprefix("encoder."): torch.from_numpy(values)
-                for name, values in parameters.items()
-                if name.startswith("encoder.")
-            }
-        )
+        # Not in bfloat16: for a single observation converting the images costs more than it saves.
+        self._layers = _layers(parameters, encoder_strides)
+        self._positions = _positions(self._height, self._width, tuple(encoder_strides))
         self._actor = NumpyActor(spec, parameters)
 
     def act(self, observation: Observation, rng: np.random.Generator, deterministic: bool = False) -> ChosenAction:
@@ -56,5 +51,23 @@ class TorchPolicy:
             for c in range(frames.shape[3]):
                 stacked[..., s * frames.shape[3] + c] = frame[..., c]
         with torch.inference_mode():
-            features: Float32Array = self._encoder(torch.from_numpy(stacked)[None])[0].numpy()
-        return features
+            features = encode_frames(torch.from_numpy(stacked)[None], self._layers, self._positions)
+        array: Float32Array = features[0].numpy()
+        return array
+
+
+def _layers(parameters: Mapping[str, Float32Array], strides: Sequence[int]) -> list[Layer]:
+    layers: list[Layer] = []
+    for i, stride in enumerate(strides):
+        # Copies, because what came is read-only.
+        kernel = torch.from_numpy(parameters[f"encoder.{i}.weight"].copy())
+        bias = parameters.get(f"encoder.{i}.bias")
+        layers.append(
+            (for_bytes(kernel) if i == 0 else kernel, None if bias is None else torch.from_numpy(bias.copy()), stride)
+        )
+    return layers
+
+
+@cache
+def _positions(height: int, width: int, strides: tuple[int, ...]) -> Tensor:
+    return map_positions(*map_size(height, width, strides)).to(torch.float32)

@@ -16,13 +16,13 @@ Names and shapes (A actions, P proprioception, H hidden size, K = 3 * 3 convolut
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import xxhash
 
 from common.errors import MessageError
 from common.messages import Float32Array, PolicyWeights, TaskSpec
@@ -104,8 +104,8 @@ def pack_weights(
     wire = _wire_dtype(dtype)
     flat = np.concatenate([np.ravel(values) for values in parameters.values()], dtype=np.float32)
     with np.errstate(over="ignore"):
-        buffer = flat.astype(wire).view(np.uint8)
-    if not np.isfinite(buffer.view(wire)).all():
+        values = flat.astype(wire, copy=False)
+    if not _all_finite(values):
         raise MessageError(f"policy weights after {updates} updates are not finite numbers in {dtype}")
     return PolicyWeights(
         version=version,
@@ -116,8 +116,8 @@ def pack_weights(
         names=list(parameters),
         shapes=[list(values.shape) for values in parameters.values()],
         dtype=dtype,
-        buffer=buffer,
-        digest=_digest(buffer),
+        buffer=values.view(np.uint8),
+        digest=_digest(values.view(np.uint8)),
     )
 
 
@@ -145,8 +145,8 @@ def unpack_weights(weights: PolicyWeights, expected: Mapping[str, list[int]]) ->
         raise MessageError(
             f"policy weights {weights.version}: expected {size * wire.itemsize} bytes, got {weights.buffer.nbytes}"
         )
-    flat = weights.buffer.view(wire).astype(np.float32)
-    if not np.isfinite(flat).all():
+    flat = weights.buffer.view(wire).astype(np.float32, copy=False)
+    if not _all_finite(flat):
         raise MessageError(f"policy weights {weights.version}: expected finite numbers, got NaN or infinity")
     parameters: dict[str, Float32Array] = {}
     start = 0
@@ -163,5 +163,14 @@ def _wire_dtype(dtype: str) -> np.dtype[Any]:
     return _WIRE_DTYPES[dtype]
 
 
+def _all_finite(values: npt.NDArray[Any]) -> bool:
+    with np.errstate(over="ignore", invalid="ignore"):
+        # What is not finite makes the sum of squares so, and that takes half the time of looking at each.
+        if values.dtype == np.float32 and np.isfinite(np.dot(values, values)):
+            return True
+    return bool(np.isfinite(values).all())
+
+
 def _digest(buffer: npt.NDArray[np.uint8]) -> str:
-    return hashlib.blake2b(np.ascontiguousarray(buffer).data, digest_size=16).hexdigest()
+    # Against accidents, not against forgers: twenty times as fast as a cryptographic hash.
+    return xxhash.xxh3_128_hexdigest(buffer.data)
