@@ -1,8 +1,8 @@
 """A policy on its way from learner to actor: its bytes, and the time to make them and to act on them.
 
 The baseline pickles what most code pushes: the state dictionaries of encoder, actor and both critics. On each side
-the learner serialises in one process and the actor applies in another, as they do in a run; only our learner has its
-allocator tuned, as it does in a run.
+the learner serialises in one process and the actor applies in another, as they do in a run; only ours have their
+allocators tuned, as they do in a run.
 """
 
 from __future__ import annotations
@@ -68,9 +68,11 @@ def our_actor(resources: ExitStack, *, path: str) -> Prepared:
     import torch
 
     from common.codec import decode
+    from common.cpu_tuning import keep_freed_memory
     from common.messages import PolicyWeights
     from common.policies import Policy, policy_from_weights
 
+    keep_freed_memory()
     torch.set_num_threads(1)
     spec, payload = thesis_task(camera=True), Path(path).read_bytes()
 

@@ -1,4 +1,4 @@
-"""Fits a process that learns to the processor it runs on."""
+"""Fits a process to the computer it runs on: its processor, and how its memory is handed out."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def tune_process(threads: int | None = None) -> CpuTuning:
         threads: threads for torch; None leaves one core to the other services: 1 of 2, 3 of 4, at most 8.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    malloc_tuned = _keep_freed_memory()
+    malloc_tuned = keep_freed_memory(reserve_mib=256, one_arena=True)
     if threads is None:
         # On a contended core two threads that wait for each other are ten times slower than one.
         threads = max(1, min(cores - 1, _MAX_THREADS))
@@ -62,16 +62,24 @@ def has_bfloat16() -> bool:
     return not flags.isdisjoint({"avx512_bf16", "amx_bf16", "bf16"})
 
 
-def _keep_freed_memory() -> bool:
-    """Stop glibc from returning freed activations to the kernel, which would page-fault them in again."""
+def keep_freed_memory(reserve_mib: int = 32, *, one_arena: bool = False) -> bool:
+    """Stop glibc from returning freed memory to the kernel, which would page-fault it in again.
+
+    Activations of an update, or the weights of a policy that arrives, are megabytes each time: faulting them in takes
+    longer than filling them.
+
+    Args:
+        reserve_mib: address space taken from the kernel at a time, MiB.
+        one_arena: share one heap among all threads. Other threads' own heaps come in pieces of 64 MiB, too small for
+            an update's; but threads that share a heap wait for each other.
+
+    Returns:
+        False where the C library is another one.
+    """
     if platform.libc_ver()[0] != "glibc":
         return False
     mallopt = ctypes.CDLL(None).mallopt
-    settings = {
-        _M_MMAP_MAX: 0,
-        _M_TRIM_THRESHOLD: 2**31 - 1,
-        _M_TOP_PAD: 256 * 1024 * 1024,
-        # Arenas of other threads are mapped in pieces of 64 MB and know no top pad.
-        _M_ARENA_MAX: 1,
-    }
+    settings = {_M_MMAP_MAX: 0, _M_TRIM_THRESHOLD: 2**31 - 1, _M_TOP_PAD: reserve_mib * 2**20}
+    if one_arena:
+        settings[_M_ARENA_MAX] = 1
     return all(mallopt(parameter, value) == 1 for parameter, value in settings.items())

@@ -8,6 +8,7 @@ from threadpoolctl import threadpool_limits
 
 from common import topics
 from common.algorithms.presets import resolve_config
+from common.cpu_tuning import keep_freed_memory
 from common.policies import initial_policy
 from common.priority import ACTOR_PRIORITY, run_before_others
 from common.run_service import end_process, run_service
@@ -23,6 +24,7 @@ def serve(service: Service, config: ActorConfig) -> None:
     spec = service.query_spec()
     if spec is None:
         return
+    keep_freed_memory()
     # Two threads that wait for each other on a contended core are a hundred times slower than one.
     threadpool_limits(config.actor.threads)
     if spec.has_camera:
