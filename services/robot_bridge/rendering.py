@@ -2,17 +2,23 @@
 
 OpenGL is loaded with the first camera: who renders nothing needs none. The backend is EGL, or else OSMesa; the
 environment variable MUJOCO_GL (``egl``, ``osmesa``) decides for one.
+
+A context can be in use by one thread at a time. It is therefore in use while a picture is drawn, and given back after
+it (5 microseconds): cameras may go from thread to thread, and threads may end.
 """
 
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
 import importlib
 import importlib.util
 import os
 import sys
+import threading
 import weakref
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +30,9 @@ from services.robot_bridge.mujoco_without_opengl import mujoco
 
 BACKENDS = {"egl": "libegl1 and libgl1-mesa-dri", "osmesa": "libosmesa6"}
 """MuJoCo's OpenGL backends that need no display, in order of preference -> the system packages they need."""
+_ANY_BACKEND = ("", "enable", "enabled", "on", "true", "1")
+"""Values of MUJOCO_GL, as MuJoCo has them: whichever works."""
+_NO_BACKEND = ("disable", "disabled", "off", "false", "0")
 MOST_GEOMETRIES = 200
 """Room for a scene's geometries; MuJoCo's default of 10 000 costs time with each picture."""
 COSTLY_EFFECTS = (
@@ -48,7 +57,7 @@ class Window:
 
 
 class OffscreenCamera:
-    """Renders a window of what a camera sees; belongs to the thread that makes it.
+    """Renders a window of what a camera sees; for any thread, one at a time.
 
     Without shadows, reflections, sky and multisampling, and only the pixels of the window: 20 to 50 times faster than
     the whole picture with all effects. The model's visual settings are changed accordingly.
@@ -77,20 +86,22 @@ class OffscreenCamera:
         else:
             self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
             self._camera.fixedcamid = model.camera(camera).id
-        self._gl_context = gl_context_class()(window.width, window.height)
-        self._gl_context.make_current()
-        self._mjr_context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr_context)
-        _open_cameras.add(self)
+        context_class = gl_context_class()
+        with _opening:
+            self._gl_context = context_class(window.width, window.height)
+            with _in_use(self._gl_context):
+                self._mjr_context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+                mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr_context)
+            _open_cameras.add(self)
 
     def picture(self, data: mujoco.MjData) -> UInt8Array:
         """Return the picture of the present state, (height, width, 3) RGB; it is the caller's."""
-        self._gl_context.make_current()  # Another camera may have been used in the meantime.
         mujoco.mjv_updateScene(
             self._model, data, self._options, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
         )
-        mujoco.mjr_render(self._picture, self._scene, self._mjr_context)
-        mujoco.mjr_readPixels(self._flipped, None, self._window, self._mjr_context)
+        with _in_use(self._gl_context):
+            mujoco.mjr_render(self._picture, self._scene, self._mjr_context)
+            mujoco.mjr_readPixels(self._flipped, None, self._window, self._mjr_context)
         return self._flipped[::-1].copy()  # OpenGL's rows run upwards.
 
     def close(self) -> None:
@@ -98,30 +109,77 @@ class OffscreenCamera:
         gl_context, self._gl_context = self._gl_context, None
         if gl_context is None:
             return
-        if self._mjr_context is not None:
-            # What is freed are numbers, which mean something else in another camera's context.
-            gl_context.make_current()
-            self._mjr_context.free()
-            self._mjr_context = None
-        gl_context.free()
+        with _in_use(gl_context):
+            if self._mjr_context is not None:
+                # What is freed are numbers, which mean something else in another camera's context.
+                self._mjr_context.free()
+                self._mjr_context = None
+            gl_context.free()
 
     def __del__(self) -> None:
         self.close()
 
 
 _open_cameras: weakref.WeakSet[OffscreenCamera] = weakref.WeakSet()
+_opening = threading.RLock()
+"""Held while OpenGL is loaded or a context made: the backends' first calls are not made for two threads."""
 
 
-@functools.cache
+class _ContextsInUse(threading.local):
+    """Of this thread, innermost last: garbage may be collected, and a camera with it, while another one draws."""
+
+    def __init__(self) -> None:
+        self.contexts: list[Any] = []
+
+
+_of_this_thread = _ContextsInUse()
+
+
+@contextlib.contextmanager
+def _in_use(gl_context: Any) -> Iterator[None]:
+    """Have a context in use in this thread; afterwards that which was before, or none."""
+    contexts = _of_this_thread.contexts
+    gl_context.make_current()
+    contexts.append(gl_context)
+    try:
+        yield
+    finally:
+        contexts.pop()
+        if contexts:
+            contexts[-1].make_current()
+        else:
+            _give_back(sys.modules[type(gl_context).__module__])
+
+
+def _give_back(backend: Any) -> None:
+    """Have no context of a backend, :mod:`mujoco.egl` or :mod:`mujoco.osmesa`, in use in this thread."""
+    if backend.__name__ == "mujoco.egl":
+        egl = backend.EGL
+        egl.eglMakeCurrent(backend.EGL_DISPLAY, egl.EGL_NO_SURFACE, egl.EGL_NO_SURFACE, egl.EGL_NO_CONTEXT)
+    else:
+        backend.osmesa.OSMesaMakeCurrent(None, None, backend.GL.GL_FLOAT, 0, 0)
+
+
 def gl_context_class() -> type:
     """Return the class of the first OpenGL backend that works here: ``GLContext`` of :mod:`mujoco.egl` or its like.
 
     Raises:
-        ServiceError: none works; the message names the packages to install.
+        ServiceError: none works, and the message names the packages to install; or MUJOCO_GL is none of its values.
     """
+    with _opening:
+        return _load_backend()
+
+
+@functools.cache
+def _load_backend() -> type:
     wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
-    if wanted in ("disable", "disabled", "off", "false", "0"):
+    if wanted in _NO_BACKEND:
         raise ServiceError(f"this task has a camera, but MUJOCO_GL={wanted} forbids OpenGL: unset it, or set egl")
+    if wanted not in (*BACKENDS, *_ANY_BACKEND):
+        raise ServiceError(
+            f"this task has a camera, and MUJOCO_GL={wanted} is no backend that draws without a display: expected "
+            f"{' or '.join(BACKENDS)}; unset it, and the first of them that works is taken"
+        )
     _load_other_llvm_first()
     os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's threads cost more than such small pictures gain from them.
     candidates = [wanted] if wanted in BACKENDS else list(BACKENDS)

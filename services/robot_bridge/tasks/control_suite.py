@@ -128,7 +128,7 @@ class ControlSuiteTask(Task):
                 frame_capture_ns=np.zeros(0, np.int64),
                 proprioception=proprioception,
             )
-        if self._camera is None:  # An OpenGL context belongs to the thread that makes it: to whoever reads.
+        if self._camera is None:  # Not before: a world that nobody looks at needs no OpenGL.
             self._camera = OffscreenCamera(self._world.model, self.WINDOW)
         frame_id = self._next_frame_id
         self._next_frame_id += 1

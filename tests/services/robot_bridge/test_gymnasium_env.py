@@ -6,6 +6,7 @@ import os
 import pickle
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium
 import numpy as np
@@ -18,6 +19,7 @@ from services.robot_bridge import gymnasium_env
 from services.robot_bridge.gymnasium_env import TaskEnv
 from services.robot_bridge.gymnasium_ids import tasks_by_id
 from services.robot_bridge.tasks import load_task
+from tests.helpers import TIMEOUT_S
 from tests.services.builders import EventClock
 from tests.services.robot_bridge.scripted import ScriptedTask
 
@@ -419,3 +421,24 @@ def test_a_large_action_is_clipped_and_an_infinite_one_refused():
 def test_a_copy_is_refused_rather_than_made_of_half_a_world(copied):
     with pytest.raises(TypeError, match="cannot be copied or pickled: make another one"):
         copied(make("relod/ReacherEasy-v0"))
+
+
+def test_any_thread_may_use_an_environment(identifier):
+    one, other = make(identifier), make(identifier)
+
+    def frames_and_more(observation):
+        return list(observation.values()) if isinstance(observation, dict) else [observation]
+
+    with ThreadPoolExecutor(1) as threads:
+        for call in (
+            lambda made: made.reset(seed=3),
+            lambda made: made.step(np.ones(2)),
+            lambda made: made.reset(seed=4),
+        ):
+            here, there = call(one), threads.submit(call, other).result(TIMEOUT_S)
+            for mine, theirs in zip(frames_and_more(here[0]), frames_and_more(there[0]), strict=True):
+                np.testing.assert_array_equal(mine, theirs)
+    one.step(np.ones(2))
+    other.step(np.ones(2))  # in this thread, and the other one has ended
+    one.close()
+    other.close()

@@ -1,8 +1,10 @@
 """Pictures without a display: a window of the whole picture, many cameras, and clear words where nothing renders."""
 
+import gc
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import mujoco
@@ -11,6 +13,7 @@ import pytest
 
 from services.robot_bridge.rendering import OffscreenCamera, Window
 from services.robot_bridge.robots.mujoco_world import MujocoWorld, load_suite_model
+from tests.helpers import TIMEOUT_S
 from tests.services.robot_bridge.opengl import skip_without_opengl
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -113,6 +116,54 @@ def test_an_unknown_camera_is_an_error(balls):
         OffscreenCamera(model, WHOLE, "below")
 
 
+def in_another_thread(function, *arguments):
+    """What the function returns in a thread that has ended when it does."""
+    with ThreadPoolExecutor(1) as threads:
+        return threads.submit(function, *arguments).result(TIMEOUT_S)
+
+
+def test_a_camera_goes_from_thread_to_thread(balls):
+    model, data = balls
+    camera = OffscreenCamera(model, WHOLE)
+    picture = camera.picture(data)
+    np.testing.assert_array_equal(in_another_thread(camera.picture, data), picture)
+    np.testing.assert_array_equal(camera.picture(data), picture)
+    theirs = in_another_thread(OffscreenCamera, model, WHOLE)
+    np.testing.assert_array_equal(theirs.picture(data), picture)
+    in_another_thread(camera.close)
+    theirs.close()
+
+
+def test_several_threads_draw_at_once(balls):
+    model, _ = balls
+
+    def draw(place):
+        data = mujoco.MjData(model)
+        mine = OffscreenCamera(model, Window(0, 0, 24 + place, 32, 24 + place, 32))
+        mujoco.mj_forward(model, data)
+        pictures = [mine.picture(data) for _ in range(30)]
+        mine.close()
+        assert all((picture == pictures[0]).all() for picture in pictures)
+        return pictures[0]
+
+    alone = [draw(place) for place in range(3)]
+    with ThreadPoolExecutor(3) as threads:
+        for one, other in zip(threads.map(draw, range(3), timeout=TIMEOUT_S), alone, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_a_camera_that_is_collected_while_another_one_draws_does_not_disturb_it(balls, monkeypatch):
+    model, data = balls
+    camera = OffscreenCamera(model, WHOLE)
+    picture = camera.picture(data)
+    garbage = [OffscreenCamera(model, WHOLE)]
+    garbage.append(garbage)  # a cycle, which only the collector finds
+    del garbage
+    draw = mujoco.mjr_render
+    monkeypatch.setattr(mujoco, "mjr_render", lambda *arguments: (gc.collect(), draw(*arguments)))
+    np.testing.assert_array_equal(camera.picture(data), picture)
+
+
 # ---------------------------------------------------------------------- backends, each in a process of its own
 
 READ = """
@@ -150,6 +201,13 @@ def test_a_backend_that_was_asked_for_is_the_only_one_tried(backend, packages):
 def test_where_opengl_is_forbidden_the_error_says_so():
     message = run(READ.format(before="", after=""), MUJOCO_GL="disabled")
     assert message == "ServiceError this task has a camera, but MUJOCO_GL=disabled forbids OpenGL: unset it, or set egl"
+
+
+@pytest.mark.parametrize("value", ["nonsense", "glfw"])
+def test_a_backend_that_is_none_is_named_with_those_that_are(value):
+    message = run(READ.format(before="", after=""), MUJOCO_GL=value)
+    assert message.startswith(f"ServiceError this task has a camera, and MUJOCO_GL={value} is no backend")
+    assert "expected egl or osmesa; unset it" in message
 
 
 def test_the_second_backend_is_taken_where_the_first_fails():
