@@ -20,6 +20,8 @@ Key = tuple[str | int, ...]
 Work = Callable[[Mapping[str, Any], Key], Mapping[str, Any]]
 """Does one job: (settings, key) -> row of plain values. A module's function: the workers import it."""
 
+_LEFT_TO_THE_CALLER = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""What a terminal, ``timeout`` or a job scheduler sends to a whole process group to end it."""
 _PR_SET_PDEATHSIG = 1
 _POLL_S = 0.2
 _TERMINATION_S = 2.0
@@ -116,7 +118,7 @@ class _Worker:
         self._process = context.Process(
             target=_serve, args=(far_end, work, settings, os.getpid()), name="grid worker", daemon=True
         )
-        with _environment(_ONE_THREAD), _without_ctrl_c():
+        with _environment(_ONE_THREAD), _deaf_to_what_ends_a_group():
             self._process.start()
         far_end.close()  # Ours only: the pipe then ends with the process.
 
@@ -153,21 +155,26 @@ class _Worker:
 
 def _serve(pipe: connection.Connection, work: Work, settings: Mapping[str, Any], parent_pid: int) -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent_pid:  # It was gone before the line above.
-        return
-    while True:
-        try:
+    if os.getppid() == parent_pid:  # Else it was gone before the line above.
+        do_jobs(pipe, work, settings)
+
+
+def do_jobs(pipe: connection.Connection, work: Work, settings: Mapping[str, Any]) -> None:
+    """Do the jobs whose keys come through a pipe, send back how each ended, until nobody is at its other end."""
+    # A pipe that is closed over there ends it (EOFError); so it does with an answer unread, or before one (OSError).
+    with contextlib.suppress(EOFError, OSError):
+        while True:
             key = pipe.recv()
-        except EOFError:
-            return
-        try:
-            # As the record will keep it: what cannot be kept is this job's failure.
-            row = json.loads(json.dumps(dict(work(settings, key)), allow_nan=False))
-            outcome: FinishedJob | JobFailure = FinishedJob(key, row)
-        except Exception as error:
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            outcome = JobFailure(key, reason, traceback.format_exc())
-        pipe.send(outcome)
+            pipe.send(_outcome(work, settings, key))
+
+
+def _outcome(work: Work, settings: Mapping[str, Any], key: Key) -> FinishedJob | JobFailure:
+    try:
+        # As the record will keep it: what cannot be kept is this job's failure.
+        return FinishedJob(key, json.loads(json.dumps(dict(work(settings, key)), allow_nan=False)))
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        return JobFailure(key, reason, traceback.format_exc())
 
 
 @contextlib.contextmanager
@@ -183,10 +190,10 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _without_ctrl_c() -> Iterator[None]:
-    """Processes started meanwhile never see Ctrl-C, which a terminal sends to all of them: this one decides."""
+def _deaf_to_what_ends_a_group() -> Iterator[None]:
+    """Processes started meanwhile never see Ctrl-C and its like, which all of a group get: this one decides."""
     resource_tracker.ensure_running()  # It would be started with the first process, and unblock signals when it is.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _LEFT_TO_THE_CALLER)
     try:
         yield
     finally:

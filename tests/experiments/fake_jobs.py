@@ -32,6 +32,7 @@ def unkeepable(settings, key):
 
 
 def signal_immunity(settings, key):
-    """Survives Ctrl-C, which reaches a terminal's whole process group."""
-    os.kill(os.getpid(), signal.SIGINT)
+    """Survives what a terminal, or whoever ends a job, sends to a whole process group."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        os.kill(os.getpid(), number)
     return {"value": key[1]}

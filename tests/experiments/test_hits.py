@@ -100,7 +100,8 @@ def test_bad_input_is_named_and_starts_nothing(tmp_path, capsys, options, words)
     assert not (tmp_path / "out").exists()
 
 
-def test_ctrl_c_keeps_what_is_finished_and_the_same_command_goes_on(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_keeps_what_is_finished_and_the_same_command_goes_on(tmp_path, number):
     options = ["--seeds", "400", "--workers", "2"]
     command = [sys.executable, "-m", "experiments.hits", *LINE, "--out", str(tmp_path / "part"), *options]
     process = subprocess.Popen(
@@ -108,11 +109,13 @@ def test_ctrl_c_keeps_what_is_finished_and_the_same_command_goes_on(tmp_path):
     )
     results = tmp_path / "part" / "results.jsonl"
     eventually(lambda: results.exists() and results.stat().st_size, "a first result")
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers as well
+    os.killpg(process.pid, number)  # as a terminal or `timeout` does: to the workers as well
     said, _ = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 130
     assert "the same command goes on from here" in said
     assert "Traceback" not in said
+    assert "failed" not in said
+    assert not (tmp_path / "part" / "failures.log").exists()
     eventually(lambda: not members_of(process.pid), "the end of all its processes")
     finished = len(table(tmp_path / "part").splitlines()) - 1
     assert 1 <= finished < 1200

@@ -1,9 +1,13 @@
 """Processes that do jobs, and what happens when one does not."""
 
 import multiprocessing
+from concurrent.futures import ThreadPoolExecutor
 
-from experiments.workers import FinishedJob, JobFailure, WorkerPool
+import pytest
+
+from experiments.workers import FinishedJob, JobFailure, WorkerPool, do_jobs
 from tests.experiments import fake_jobs
+from tests.helpers import TIMEOUT_S
 
 JOBS = [("squares", number) for number in range(6)]
 
@@ -37,7 +41,7 @@ def test_a_row_that_cannot_be_kept_is_its_job_s_failure():
     assert failure.reason.startswith("ValueError")
 
 
-def test_ctrl_c_is_left_to_the_caller():
+def test_ctrl_c_and_other_ends_of_a_group_are_left_to_the_caller():
     assert [outcome.row["value"] for outcome in outcomes(fake_jobs.signal_immunity, 1, jobs=JOBS[:2])] == [0, 1]
 
 
@@ -56,3 +60,17 @@ def test_whoever_is_asked_to_stop_leaves_no_process_behind():
         next(running)
         assert multiprocessing.active_children()
     assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("answer_is_there", [False, True])
+def test_a_caller_that_goes_without_its_answer_ends_a_worker_quietly(answer_is_there):
+    near_end, far_end = multiprocessing.Pipe()
+    near_end.send(JOBS[2])
+    with ThreadPoolExecutor(1) as threads:
+        if not answer_is_there:
+            near_end.close()
+        working = threads.submit(do_jobs, far_end, fake_jobs.square, {"offset": 0})
+        if answer_is_there:
+            assert near_end.poll(TIMEOUT_S)
+            near_end.close()
+        assert working.result(TIMEOUT_S) is None
