@@ -27,11 +27,14 @@ from typing import Any, Self
 
 from common.errors import ConfigError, RelodError
 from common.record import write_atomically
+from experiments.wording import plural
 from experiments.workers import JobFailure, Key, WorkerPool
 
 Row = Mapping[str, Any]
 
 _KEY = "key"
+_ANOTHER_FOLDER = "choose another folder with --out"
+"""All programs that have a grid have that option."""
 
 
 class GridError(RelodError):
@@ -64,7 +67,7 @@ class GridRecord:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 raise GridError(
-                    f"{directory}: another program is working there; wait for it, or choose another"
+                    f"{directory}: another program is working there; wait for it, or {_ANOTHER_FOLDER}"
                 ) from None
             self._settle_settings(settings)
             self._file = stack.enter_context((directory / "results.jsonl").open("a+b"))
@@ -100,7 +103,7 @@ class GridRecord:
             try:
                 known = dict(json.loads(path.read_text(encoding="utf-8")))
             except (ValueError, TypeError) as error:
-                raise GridError(f"{path} cannot be understood: {error}; choose another folder") from error
+                raise GridError(f"{path} cannot be understood: {error}; {_ANOTHER_FOLDER}") from error
         different = [
             f"{name}: {known[name]!r} there, now {value!r}"
             for name, value in wanted.items()
@@ -109,7 +112,7 @@ class GridRecord:
         if different:
             raise ConfigError(
                 f"{self.directory} holds results of other settings ({'; '.join(different)}): "
-                "ask for the same, or choose another folder"
+                f"ask for the same, or {_ANOTHER_FOLDER}"
             )
         if set(wanted) - set(known):
             write_atomically(path, json.dumps({**known, **wanted}, indent=1, sort_keys=True) + "\n")
@@ -137,7 +140,7 @@ def _refuse_foreign(directory: Path) -> None:
     if names and not names & {"settings.json", "results.jsonl"}:
         raise GridError(
             f"{directory} holds other files ({', '.join(sorted(names)[:3])}): expected an empty folder, or one with "
-            "results of this program"
+            f"results of this program: {_ANOTHER_FOLDER}"
         )
 
 
@@ -154,7 +157,7 @@ class GridProgress:
 
     def __str__(self) -> str:
         left = "" if self.left_s is None else f", {duration_text(self.left_s)} left"
-        return f"{self.finished}/{self.jobs} jobs{left}"
+        return f"{self.finished}/{self.jobs} {plural(self.jobs, 'job')}{left}"
 
 
 def run_grid(
@@ -198,6 +201,11 @@ def run_grid(
             remaining.finished(costs.pop(outcome.key))
         tell()
     return failures
+
+
+def failure_text(failure: JobFailure) -> str:
+    """That a job has failed, to be read while the others are at work."""
+    return f"{key_text(failure.key)} failed: {failure.reason}; the rest goes on"
 
 
 def key_text(key: Key) -> str:

@@ -12,11 +12,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from common.errors import RelodError
 from common.record import write_atomically
 from deploy.console import Console
 from deploy.stop_signals import INTERRUPTED, StopSignals
-from experiments.grid import GridRecord, key_text, run_grid
+from experiments.command_line import exit_code
+from experiments.grid import GridRecord, failure_text, run_grid
 from experiments.target_hits.choice import (
     TaskChoice,
     add_options,
@@ -28,8 +28,9 @@ from experiments.target_hits.choice import (
 from experiments.target_hits.counting import STEPS
 from experiments.target_hits.figure import draw_hits
 from experiments.target_hits.jobs import all_keys, hit_counts, relative_cost, work
-from experiments.target_hits.table import cells, csv_text, table_text
-from experiments.workers import JobFailure, WorkerPool
+from experiments.target_hits.table import cells, csv_text, notes, table_text
+from experiments.wording import counted
+from experiments.workers import WorkerPool
 
 SEEDS = 30
 
@@ -38,44 +39,42 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Count from the command line; return the exit code."""
     options = _parser().parse_args(arguments)
     console = Console()
-    try:
-        limits = check_limits(options.limits)
-        seeds = range(check_count("--seeds", options.seeds))
-        steps = check_count("--steps", options.steps)
-        workers = check_count("--workers", options.workers)
-        choices = [choose_task(name, options.preset, options.set) for name in dict.fromkeys(options.task)]
-        with StopSignals() as stop:
-            settings = record_settings(choices, steps=steps)
-            keys = all_keys((choice.name for choice in choices), limits, seeds)
-            with (
-                GridRecord(Path(options.out), settings) as record,
-                WorkerPool(work, settings, workers) as pool,
-            ):
-                console.line(_beginning(choices, record, len(keys), sum(key in record.rows for key in keys)))
-                failures = run_grid(
-                    record,
-                    keys,
-                    pool,
-                    progress=lambda progress: console.status(str(progress)),
-                    failed=lambda failure: console.error(_failure_text(failure)),
-                    asked_to_stop=lambda: stop.asked,
-                    cost=relative_cost(settings),
-                )
-                write_results(record, steps, console)
-        if stop.asked:
-            console.line("interrupted: the same command goes on from here")
-            return INTERRUPTED
-        if failures:
-            console.error(
-                f"{len(failures)} of {len(keys)} jobs failed (tracebacks: {record.directory / 'failures.log'}); "
-                "the same command tries them again"
+    return exit_code("experiments.hits", "--out", Path(options.out), console, lambda: _count(options, console))
+
+
+def _count(options: argparse.Namespace, console: Console) -> int:
+    limits = check_limits(options.limits)
+    seeds = range(check_count("--seeds", options.seeds))
+    steps = check_count("--steps", options.steps)
+    workers = check_count("--workers", options.workers)
+    choices = [choose_task(name, options.preset, options.set) for name in dict.fromkeys(options.task)]
+    with StopSignals() as stop:
+        settings = record_settings(choices, steps=steps)
+        keys = all_keys((choice.name for choice in choices), limits, seeds)
+        with (
+            GridRecord(Path(options.out), settings) as record,
+            WorkerPool(work, settings, workers) as pool,
+        ):
+            console.line(_beginning(choices, record, len(keys), sum(key in record.rows for key in keys)))
+            failures = run_grid(
+                record,
+                keys,
+                pool,
+                progress=lambda progress: console.status(str(progress)),
+                failed=lambda failure: console.error(failure_text(failure)),
+                asked_to_stop=lambda: stop.asked,
+                cost=relative_cost(settings),
             )
-        return 1 if failures else 0
-    except RelodError as error:
-        console.error(f"experiments.hits: error: {error}")
-    except OSError as error:
-        console.error(f"experiments.hits: error: {error.filename or 'system'}: {error.strerror}")
-    return 1
+            write_results(record, steps, console)
+    if stop.asked:
+        console.line("interrupted: the same command goes on from here")
+        return INTERRUPTED
+    if failures:
+        console.error(
+            f"{len(failures)} of {counted(len(keys), 'job')} failed (tracebacks: "
+            f"{record.directory / 'failures.log'}); the same command tries them again"
+        )
+    return 1 if failures else 0
 
 
 def write_results(record: GridRecord, steps: int, console: Console) -> None:
@@ -88,17 +87,15 @@ def write_results(record: GridRecord, steps: int, console: Console) -> None:
     summary = cells(counts)
     draw_hits(record.directory / "hits.png", summary, steps, show_sufficient=steps == STEPS)
     console.line(table_text(summary, steps))
+    for note in notes(summary, steps):
+        console.line(f"\n{note}")
     console.line(f"\n{path}, {record.directory / 'hits.png'}")
 
 
 def _beginning(choices: Sequence[TaskChoice], record: GridRecord, jobs: int, finished: int) -> str:
     tasks = ", ".join(f"{choice.name} ({choice.preset})" for choice in choices)
     there = f", {finished} of them in {record.directory} already" if finished else ""
-    return f"{tasks}: {jobs} jobs{there}"
-
-
-def _failure_text(failure: JobFailure) -> str:
-    return f"{key_text(failure.key)} failed: {failure.reason}; the rest goes on"
+    return f"{tasks}: {counted(jobs, 'job')}{there}"
 
 
 def _parser() -> argparse.ArgumentParser:

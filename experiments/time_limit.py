@@ -22,7 +22,8 @@ from common.errors import ConfigError, RelodError
 from common.record import write_atomically
 from deploy.console import Console
 from deploy.stop_signals import INTERRUPTED, StopSignals
-from experiments.grid import GridRecord, key_text, run_grid
+from experiments.command_line import exit_code
+from experiments.grid import GridRecord, failure_text, key_text, run_grid
 from experiments.target_hits.advice import TaskFacts, advice
 from experiments.target_hits.certainty import FEWEST_BLOCKS
 from experiments.target_hits.choice import (
@@ -37,7 +38,8 @@ from experiments.target_hits.counting import STEPS
 from experiments.target_hits.guideline import Evidence, Thoroughness, judge, next_look
 from experiments.target_hits.jobs import all_keys, hits_key, relative_cost, start_key, work
 from experiments.target_hits.search import EFFORT
-from experiments.workers import JobFailure, Key, WorkerPool
+from experiments.wording import counted
+from experiments.workers import Key, WorkerPool
 
 SEEDS_AT_ONCE = 5
 STARTS_AT_ONCE = 10
@@ -82,7 +84,7 @@ class Inquiry:
         missing = [key for key in [*self._hits_keys(), *self._start_keys()] if key not in record.rows]
         if missing:
             raise RelodError(
-                f"{len(missing)} jobs failed ({key_text(missing[0])} first), so there is no answer; "
+                f"{counted(len(missing), 'job')} failed ({key_text(missing[0])} first), so there is no answer; "
                 f"see {record.directory / 'failures.log'}. The same command tries them again"
             )
         return Evidence(
@@ -122,7 +124,7 @@ def inquire(
             jobs,
             pool,
             progress=lambda progress: console.status(f"{progress} until the next judgement"),
-            failed=lambda failure: console.error(_failure_text(failure)),
+            failed=lambda failure: console.error(failure_text(failure)),
             asked_to_stop=asked_to_stop,
             cost=cost,
         )
@@ -136,22 +138,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Answer from the command line; return the exit code."""
     options = _parser().parse_args(arguments)
     console = Console()
-    try:
-        limits = check_limits(options.limits)
-        workers = check_count("--workers", options.workers)
-        if options.seed < 0:
-            raise ConfigError(f"--seed {options.seed}: expected at least 0")
-        choice = choose_task(options.task, options.preset, options.set)
-        thoroughness = Thoroughness()
-        effort = check_count("--effort", options.effort)
-        if effort < max(limits):
-            raise ConfigError(
-                f"--effort {effort}: expected at least the longest of the limits, {max(limits)} steps: "
-                "a shorter search cannot tell whether the goal can be reached within it"
-            )
+    return exit_code("experiments.time_limit", "--out", Path(options.out), console, lambda: _answer(options, console))
+
+
+def _answer(options: argparse.Namespace, console: Console) -> int:
+    limits = check_limits(options.limits)
+    workers = check_count("--workers", options.workers)
+    if options.seed < 0:
+        raise ConfigError(f"--seed {options.seed}: expected at least 0")
+    choice = choose_task(options.task, options.preset, options.set)
+    thoroughness = Thoroughness()
+    effort = check_count("--effort", options.effort)
+    if effort < max(limits):
+        raise ConfigError(
+            f"--effort {effort}: expected at least the longest of the limits, {counted(max(limits), 'step')}: "
+            "a shorter search cannot tell whether the goal can be reached within it"
+        )
+    with StopSignals() as stop:
         settings = record_settings([choice], steps=STEPS, effort=effort)
         with (
-            StopSignals() as stop,
             GridRecord(Path(options.out), settings) as record,
             WorkerPool(work, settings, workers) as pool,
         ):
@@ -164,28 +169,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 lambda: stop.asked,
                 relative_cost(settings),
             )
-        if evidence is None:
-            console.line("interrupted: the same command goes on from here")
-            return INTERRUPTED
-        text = advice(_facts(choice, options.effort), evidence, judge(evidence, thoroughness), thoroughness)
-        path = Path(options.out) / f"time_limit_{choice.name}.txt"
-        write_atomically(path, text + "\n")
-        console.line(f"\n{text}\n\n{path}")
-        return 0
-    except RelodError as error:
-        console.error(f"experiments.time_limit: error: {error}")
-    except OSError as error:
-        console.error(f"experiments.time_limit: error: {error.filename or 'system'}: {error.strerror}")
-    return 1
+    if evidence is None:
+        console.line("interrupted: the same command goes on from here")
+        return INTERRUPTED
+    text = advice(_facts(choice, effort), evidence, judge(evidence, thoroughness), thoroughness)
+    path = Path(options.out) / f"time_limit_{choice.name}.txt"
+    write_atomically(path, text + "\n")
+    console.line(f"\n{text}\n\n{path}")
+    return 0
 
 
 def _facts(choice: TaskChoice, effort: int) -> TaskFacts:
     spec = choice.build(np.random.default_rng(0)).spec
     return TaskFacts(choice.name, choice.preset, spec.action_cycle_time_s, spec.reset_steps, effort)
-
-
-def _failure_text(failure: JobFailure) -> str:
-    return f"{key_text(failure.key)} failed: {failure.reason}"
 
 
 def _parser() -> argparse.ArgumentParser:

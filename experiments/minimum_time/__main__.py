@@ -11,9 +11,9 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from common.errors import ConfigError, RelodError
 from deploy.console import Console
 from deploy.stop_signals import INTERRUPTED, StopSignals
+from experiments.command_line import exit_code
 from experiments.grid import GridRecord, Row, duration_text, run_grid
 from experiments.minimum_time.figures import draw_figures
 from experiments.minimum_time.folders import RESULTS, keep_crashed, remove_half_finished, runs_folder
@@ -23,7 +23,7 @@ from experiments.minimum_time.report import table_text, write_report
 from experiments.minimum_time.results import collect
 from experiments.minimum_time.sizes import SIZES, Size
 from experiments.minimum_time.tables import write_tables
-from experiments.target_hits.choice import usable_cores
+from experiments.target_hits.choice import check_count, usable_cores
 from experiments.workers import JobFailure, Key, Work, WorkerPool
 
 _NAME = "experiments.minimum_time"
@@ -114,19 +114,16 @@ def main(arguments: Sequence[str] | None = None, sizes: Mapping[str, Size] = SIZ
     options = parser.parse_args(arguments)
     console = Console()
     out: Path = options.out or RESULTS / options.size
-    try:
-        if options.workers < 1:
-            raise ConfigError(f"--workers {options.workers}: expected at least 1")
+
+    def study() -> int:
+        workers = check_count("--workers", options.workers)
         plan = Plan(sizes[options.size])
         if options.plan:
-            console.line(plan.text(options.workers))
+            console.line(plan.text(workers))
             return 0
-        return run_study(plan, out.absolute(), options.workers, console, do)
-    except RelodError as error:
-        console.error(f"{_NAME}: error: {error}")
-    except OSError as error:
-        console.error(f"{_NAME}: error: {error.filename or out}: {error.strerror}")
-    return 1
+        return run_study(plan, out.absolute(), workers, console, do)
+
+    return exit_code(_NAME, "--out", out, console, study)
 
 
 if __name__ == "__main__":

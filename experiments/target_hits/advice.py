@@ -16,7 +16,8 @@ from experiments.target_hits.guideline import (
     Thoroughness,
     Verdict,
 )
-from experiments.target_hits.table import hits_text, standard_error
+from experiments.target_hits.table import TRIVIAL_ADVICE, hits_text, standard_error
+from experiments.wording import counted, plural
 
 _HITS = f"{SUFFICIENT_HITS:g} hits"
 
@@ -32,9 +33,9 @@ class TaskFacts:
     effort: int
     """Most steps of the search from one start."""
 
-    def duration(self, steps: float) -> str:
+    def duration(self, steps: int) -> str:
         """Steps, and what they are in seconds of the real robot's clock."""
-        return f"{steps:g} steps ({steps * self.action_cycle_time_s:.3g} s)"
+        return f"{counted(steps, 'step')} ({steps * self.action_cycle_time_s:.3g} s)"
 
 
 def advice(facts: TaskFacts, evidence: Evidence, verdict: Verdict, thoroughness: Thoroughness) -> str:
@@ -88,8 +89,8 @@ def _minimum(facts: TaskFacts, evidence: Evidence) -> str:
     if not searched:
         return "not looked for, since no limit has enough hits."
     how = (
-        f"a search tried plans of commands from {searched} random starts, up to {facts.effort} steps each, and found a "
-        f"way to the goal from {found} of them."
+        f"a search tried plans of commands from {counted(searched, 'random start')}, up to "
+        f"{counted(facts.effort, 'step')} each, and found a way to the goal from {found} of them."
     )
     if found:
         how += " What it finds is possible; the true minimum can only be less."
@@ -100,12 +101,15 @@ def _minimum(facts: TaskFacts, evidence: Evidence) -> str:
         return f"not known; {how}"
     known = sorted(steps for steps in evidence.starts if steps is not None)
     return (
-        f"{facts.duration(steps)}: whoever knows the way reaches the goal within them from nine of ten starts "
+        f"{facts.duration(steps)}: whoever knows the way reaches the goal within {'it' if steps == 1 else 'them'} "
+        "from nine of ten starts "
         f"(from half of the starts within {known[(searched + 1) // 2 - 1]}). {how[0].upper()}{how[1:]}"
     )
 
 
 def _admissible(evidence: Evidence, verdict: Verdict) -> str:
+    if verdict.answer is Answer.TRIVIAL:
+        return "of no importance"
     clear = [f"{limit}" for limit, finding in verdict.findings.items() if finding.admissible]
     perhaps = [
         f"{limit}"
@@ -120,6 +124,8 @@ def _headline(facts: TaskFacts, verdict: Verdict) -> str:
     if verdict.answer is Answer.USE:
         assert verdict.limit is not None
         return facts.duration(verdict.limit)
+    if verdict.answer is Answer.TRIVIAL:
+        return "none; the task is trivial as it is"
     if verdict.answer is Answer.BORDERLINE:
         assert verdict.limit is not None
         return f"borderline; if you try, {facts.duration(verdict.limit)}"
@@ -130,6 +136,7 @@ def _headline(facts: TaskFacts, verdict: Verdict) -> str:
 
 def _reason(evidence: Evidence, verdict: Verdict) -> str:
     sentences = {
+        Answer.TRIVIAL: _why_trivial,
         Answer.USE: _why_use,
         Answer.BORDERLINE: _why_borderline,
         Answer.TOO_SHORT: _why_too_short,
@@ -138,13 +145,33 @@ def _reason(evidence: Evidence, verdict: Verdict) -> str:
     return " ".join(sentences)
 
 
+def _why_trivial(evidence: Evidence, verdict: Verdict) -> list[str]:
+    limit = verdict.limit
+    assert limit is not None
+    often = (
+        f"under {counted(limit, 'step')} the untrained policy reaches the goal every "
+        f"{evidence.steps_per_hit(limit):.1f} steps, resets included"
+    )
+    if evidence.minimum_steps == 1:
+        share = f"{100 * evidence.share_in_time(1):.0f} %"
+        return [
+            f"from {share} of the starts a single step suffices, so there is no time to save; {often}.",
+            TRIVIAL_ADVICE,
+        ]
+    return [
+        f"{often}, and the search knows no ways that are much shorter: {evidence.mean_way:.1f} steps on average. "
+        "Whatever is done, the goal comes.",
+        TRIVIAL_ADVICE,
+    ]
+
+
 def _why_use(evidence: Evidence, verdict: Verdict) -> list[str]:
     limit = verdict.limit
     assert limit is not None
     sentences = [
-        f"under {limit} steps the untrained policy reaches the goal {evidence.mean_hits(limit):.1f} times in 20 000 "
-        f"steps, more than the {SUFFICIENT_HITS:g} that learning needs to get going, and the goal can be reached in "
-        f"time from {100 * evidence.share_in_time(limit):.0f} % of the starts."
+        f"under {counted(limit, 'step')} the untrained policy reaches the goal {evidence.mean_hits(limit):.1f} times "
+        f"in 20 000 steps, more than the {SUFFICIENT_HITS:g} that learning needs to get going, and the goal can be "
+        f"reached in time from {100 * evidence.share_in_time(limit):.0f} % of the starts."
     ]
     short = [other for other, finding in verdict.findings.items() if finding.length is Side.BELOW and other < limit]
     if short:
@@ -170,9 +197,9 @@ def _why_borderline(evidence: Evidence, verdict: Verdict) -> list[str]:
     sentences = [
         f"of no limit is it clear that it has more than {_HITS} and is long enough. {_list(verdict.borderline)} may "
         f"be admissible; it is not clear that {' and '.join(_doubts(verdict))}.",
-        f"Under {limit} steps there are {evidence.mean_hits(limit):.1f} hits, and the goal can be reached in time from "
-        f"{100 * evidence.share_in_time(limit):.0f} % of the starts. Learning may succeed, slowly or not with every "
-        "seed. A larger target or shorter resets would make it safer.",
+        f"Under {counted(limit, 'step')} there are {evidence.mean_hits(limit):.1f} hits, and the goal can be reached "
+        f"in time from {100 * evidence.share_in_time(limit):.0f} % of the starts. Learning may succeed, slowly or not "
+        "with every seed. A larger target or shorter resets would make it safer.",
     ]
     short = [other for other, finding in verdict.findings.items() if finding.length is Side.BELOW]
     return [*sentences, _why_short(evidence, short)] if short else sentences
@@ -185,12 +212,14 @@ def _why_too_short(evidence: Evidence, verdict: Verdict) -> list[str]:
     if not enough:
         minimum = evidence.minimum_steps
         assert minimum is not None
+        tried = "the limit that was tried is" if len(short) == 1 else "all limits that were tried are"
         return [
-            f"all limits that were tried are below the minimum steps ({minimum}), and hits under them say nothing "
-            "about longer ones: give longer ones with --limits."
+            f"{tried} below the minimum steps ({minimum}), and hits under {'it' if len(short) == 1 else 'them'} say "
+            "nothing about longer ones: give longer ones with --limits."
         ]
     sentences = [
-        f"the limits with enough hits ({_list(enough)}) are too short. {_why_short(evidence, short)}",
+        f"the {plural(len(enough), 'limit')} with enough hits ({_list(enough)}) "
+        f"{'is' if len(enough) == 1 else 'are'} too short. {_why_short(evidence, short)}",
         "That is as far as the search can tell; with a larger --effort it looks longer for a way.",
     ]
     if long:
@@ -202,6 +231,7 @@ def _why_too_short(evidence: Evidence, verdict: Verdict) -> list[str]:
 
 def _why_not(evidence: Evidence, verdict: Verdict) -> list[str]:
     found = sum(steps is not None for steps in evidence.starts)
+    searched = counted(len(evidence.starts), "start")
     counts = [count for counts in evidence.hits.values() for count in counts]
     if not any(counts):
         sentences = [
@@ -210,17 +240,17 @@ def _why_not(evidence: Evidence, verdict: Verdict) -> list[str]:
     else:
         best = max(evidence.hits, key=evidence.mean_hits)
         sentences = [
-            f"no limit has more than {_HITS}; the most are {evidence.mean_hits(best):.1f}, at {best} steps. With so "
-            "few, a policy has nothing to learn from."
+            f"no limit has more than {_HITS}; the most are {evidence.mean_hits(best):.1f}, at "
+            f"{counted(best, 'step')}. With so few, a policy has nothing to learn from."
         ]
     if evidence.starts and not found:
         sentences.append(
-            f"Nor did the search find a way, from any of {len(evidence.starts)} starts. Check that the goal can be "
+            f"Nor did the search find a way, from any of {searched}. Check that the goal can be "
             "reached at all and that the task notices it: does an attempt ever end as terminated?"
         )
     elif evidence.starts:
         sentences.append(
-            f"The search found a way from {found} of {len(evidence.starts)} starts, so the goal can be reached, but "
+            f"The search found a way from {found} of {searched}, so the goal can be reached, but "
             "not by chance often enough. A larger target, faster commands or starts nearer to the goal would help."
         )
     return sentences

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import inspect
+import itertools
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,6 +17,8 @@ import numpy as np
 
 from common.config import parse_override
 from common.errors import ConfigError
+from experiments.target_hits.initial_policy import initial_actions
+from experiments.target_hits.world import NotMinimumTimeError, World
 from services.robot_bridge.tasks import Task, load_task
 
 LIMITS = (1, 2, 5, 10, 25, 50, 100, 500, 1000, 5000)
@@ -23,6 +26,7 @@ LIMITS = (1, 2, 5, 10, 25, 50, 100, 500, 1000, 5000)
 PREFERRED_PRESET = "thesis"
 """Taken where a task has it and nobody asks for another: its numbers can be compared with the thesis's."""
 
+_FIRST_LOOK_STEPS = 100
 _SECTION = "task"
 _DECIDES_WORLDS = ("numpy", "mujoco", "dm-control")
 """Packages whose next version may draw or simulate differently."""
@@ -44,7 +48,7 @@ class TaskChoice:
 
 
 def choose_task(name: str, preset: str | None = None, overrides: Sequence[str] = ()) -> TaskChoice:
-    """Check a choice by building the task once.
+    """Check a choice by building the task, and by a first look at its rewards.
 
     Args:
         name: task id, or ``id=module:Class`` for a task that is not in the table.
@@ -52,7 +56,7 @@ def choose_task(name: str, preset: str | None = None, overrides: Sequence[str] =
         overrides: ``task.key=value``.
 
     Raises:
-        ConfigError: unknown task, preset or setting, or a task without goal.
+        ConfigError: unknown task, preset or setting, a task without goal, or not with -1 a step.
     """
     task_id, equals, target = name.partition("=")
     rows = {task_id: target} if equals else {}
@@ -75,7 +79,27 @@ def choose_task(name: str, preset: str | None = None, overrides: Sequence[str] =
             f"--task {task_id}: it has no goal to hit, its attempts end at the time limit only; "
             "target hits and the guideline are for minimum-time tasks, whose attempts end where the goal is reached"
         )
-    return TaskChoice(task_id, task.spec.preset, values, rows)
+    choice = TaskChoice(task_id, task.spec.preset, values, rows)
+    _look_at_rewards(choice)
+    return choice
+
+
+def _look_at_rewards(choice: TaskChoice) -> None:
+    """Refuse a task at once, and once, that the jobs would refuse one after the other."""
+    rng = np.random.default_rng(0)
+    task = choice.build(rng)
+    try:
+        world = World(task)
+        world.begin_episode()
+        for action in itertools.islice(initial_actions(world.spec, rng), _FIRST_LOOK_STEPS):
+            if world.reaches_goal(action):
+                world.begin_episode()
+    except NotMinimumTimeError as error:
+        raise ConfigError(f"--task {choice.name}: {error}") from error
+    except Exception:  # Whatever else is wrong with it, the jobs say, with a traceback.
+        return
+    finally:
+        task.close()
 
 
 def record_settings(choices: Sequence[TaskChoice], **counted: int) -> dict[str, Any]:

@@ -31,10 +31,14 @@ from enum import Enum
 import numpy as np
 
 from experiments.target_hits.certainty import FEWEST_BLOCKS, Side, side_of_mean, side_of_share
+from experiments.target_hits.counting import STEPS
 
 SUFFICIENT_HITS = 10.0
 """Of the initial policy in 20 000 steps (thesis 7.3)."""
 SHARE_OF_STARTS = 0.9
+AS_FAST_AS_CAN_BE = 1.25
+"""A task is trivial if the initial policy's mean steps to the goal are at most so many times the fewest that are known:
+whatever is done, the goal comes. For the tasks of the thesis they are some 30 times as many, and more."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,17 @@ class Evidence:
         """Starts from which the goal can be reached within the limit."""
         return sum(steps is not None and steps <= limit for steps in self.starts)
 
+    def steps_per_hit(self, limit: int) -> float:
+        """Steps that the initial policy takes from hit to hit, resets included."""
+        mean = self.mean_hits(limit)
+        return STEPS / mean if mean else math.inf
+
+    @property
+    def mean_way(self) -> float:
+        """Mean of the shortest ways found, over the starts from which there is one; NaN without."""
+        known = [steps for steps in self.starts if steps is not None]
+        return float(np.mean(known)) if known else math.nan
+
     @property
     def minimum_steps(self) -> int | None:
         """Steps within which :data:`SHARE_OF_STARTS` of the starts can reach the goal; None: not known to be finite."""
@@ -105,6 +120,8 @@ class LimitFinding:
 class Answer(Enum):
     """What comes of it."""
 
+    TRIVIAL = "trivial"
+    """The initial policy reaches the goal as fast as anyone could, or a step suffices: there is no time to save."""
     USE = "use"
     """There is an admissible limit."""
     BORDERLINE = "borderline"
@@ -121,7 +138,7 @@ class Verdict:
 
     answer: Answer
     limit: int | None
-    """The limit to start with; None where there is none."""
+    """The limit to start with, or under which the task is trivial; None where there is none."""
     borderline: tuple[int, ...]
     """Limits of which it cannot be told whether they are admissible, as far as it would matter."""
     findings: Mapping[int, LimitFinding] = field(default_factory=dict)
@@ -178,6 +195,8 @@ def next_look(evidence: Evidence, thoroughness: Thoroughness) -> NextLook:
 def judge(evidence: Evidence, thoroughness: Thoroughness) -> Verdict:
     """Decide, with whatever evidence there is."""
     findings = find(evidence, thoroughness)
+    if (trivial_limit := _trivial_limit(evidence, findings)) is not None:
+        return Verdict(Answer.TRIVIAL, trivial_limit, (), findings)
     admissible = next((limit for limit, finding in findings.items() if finding.admissible), None)
     open_limits = tuple(
         limit
@@ -194,6 +213,23 @@ def judge(evidence: Evidence, thoroughness: Thoroughness) -> Verdict:
     if open_limits:
         return Verdict(Answer.BORDERLINE, _most_promising(evidence, open_limits), open_limits, findings)
     return Verdict(Answer.TOO_SHORT, None, (), findings)
+
+
+def _trivial_limit(evidence: Evidence, findings: Mapping[int, LimitFinding]) -> int | None:
+    """The limit under which the task shows that it is trivial, if it is.
+
+    Of limits that are long enough only: under shorter ones those starts are chosen by chance from which it is near.
+    """
+    long_enough = [
+        limit
+        for limit, finding in findings.items()
+        if finding.hits is not Side.BELOW and evidence.starts and evidence.share_in_time(limit) >= SHARE_OF_STARTS
+    ]
+    if not long_enough:
+        return None
+    fastest = min(long_enough, key=evidence.steps_per_hit)
+    trivial = evidence.minimum_steps == 1 or evidence.steps_per_hit(fastest) <= AS_FAST_AS_CAN_BE * evidence.mean_way
+    return fastest if trivial else None
 
 
 def _most_promising(evidence: Evidence, limits: tuple[int, ...]) -> int:

@@ -10,6 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.target_hits.jobs import HitCount
+from experiments.wording import counted, plural
+
+TRIVIAL_ADVICE = (
+    "There is nothing to learn, under any limit. Check the task's termination: does an attempt end as terminated only "
+    "where the goal is reached, and do starts lie away from it?"
+)
 
 
 @dataclass(frozen=True)
@@ -50,13 +56,29 @@ def csv_text(counts: Iterable[HitCount]) -> str:
 
 def table_text(of: Sequence[Cell], steps: int) -> str:
     """The cells, a task a block."""
-    lines = [f"target hits of the initial policy in {steps} steps, resets included: mean ± standard error (seeds)"]
+    lines = [
+        f"target hits of the initial policy in {counted(steps, 'step')}, resets included: mean ± standard error (seeds)"
+    ]
     for task in dict.fromkeys(cell.task for cell in of):
         lines += ["", f"{task:>24}"]
         for cell in of:
             if cell.task == task:
-                lines.append(f"{cell.limit:>16} steps  {hits_text(cell.mean, cell.standard_error)} ({cell.seeds})")
+                steps_text = f"{cell.limit:>16} {plural(cell.limit, 'step'):<5}"
+                lines.append(f"{steps_text}  {hits_text(cell.mean, cell.standard_error)} ({cell.seeds})")
     return "\n".join(lines)
+
+
+def notes(of: Iterable[Cell], steps: int) -> list[str]:
+    """What the numbers alone do not say: a sentence for each task that is done as soon as it begins."""
+    fastest: dict[str, Cell] = {}
+    for cell in of:
+        if cell.mean > steps / 2 and (cell.task not in fastest or cell.mean > fastest[cell.task].mean):
+            fastest[cell.task] = cell
+    return [
+        f"{task} is trivial: under {counted(cell.limit, 'step')} the untrained policy reaches the goal every "
+        f"{steps / cell.mean:.1f} steps. {TRIVIAL_ADVICE}"
+        for task, cell in fastest.items()
+    ]
 
 
 def hits_text(mean: float, error: float) -> str:

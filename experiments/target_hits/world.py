@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+from common.errors import RelodError
 from common.messages import Float32Array
 from services.robot_bridge.tasks import Task
+
+REWARD = -1.0
+"""Of each step (thesis 6.1). The hits and the guideline are about nothing else."""
+
+
+class NotMinimumTimeError(RelodError):
+    """A task gives another reward than :data:`REWARD`."""
 
 
 class World:
@@ -30,8 +38,20 @@ class World:
         self._task.begin_attempt()
 
     def reaches_goal(self, action: Float32Array) -> bool:
-        """Act for one cycle; return whether the goal is reached at its end."""
+        """Act for one cycle; return whether the goal is reached at its end.
+
+        Raises:
+            NotMinimumTimeError: the reward is not that of a minimum-time task.
+        """
         self._command(action)
         self._now_ns += self._cycle_ns
         self._advance_to(self._now_ns)
-        return self._outcome().terminated
+        outcome = self._outcome()
+        if outcome.reward != REWARD:  # NaN is not, either.
+            raise NotMinimumTimeError(
+                f"task {self.spec.task} gave a reward of {outcome.reward} in step {self._now_ns // self._cycle_ns}"
+                f"{', which reached the goal' if outcome.terminated else ''}: expected {REWARD:g} in every step, that "
+                "which reaches the goal as well; of any other reward, target hits and the guideline for the time "
+                "limit say nothing"
+            )
+        return outcome.terminated

@@ -63,7 +63,7 @@ def test_other_settings_are_refused_and_change_nothing(tmp_path, capsys):
     assert count(tmp_path, "--seeds", "1", "--steps", "2001") == 1
     assert "steps: 2000 there, now 2001" in capsys.readouterr().err
     assert count(tmp_path, "--seeds", "1", "--set", "task.reset_steps=9") == 1
-    assert "choose another" in capsys.readouterr().err
+    assert "choose another folder with --out" in capsys.readouterr().err
     assert table(tmp_path) == before
 
 
@@ -76,6 +76,38 @@ def test_a_task_that_breaks_is_reported_and_the_rest_goes_on(tmp_path, capsys):
     assert "1 of 2 jobs failed" in said.err
     assert [line.rpartition(",")[0] for line in table(tmp_path).splitlines()[1:]] == ["fragile,1000,0"]
     assert "in begin_attempt" in (tmp_path / "failures.log").read_text()
+
+
+@pytest.mark.parametrize(("task", "reward"), [("Generous", "0.2"), ("Prize", "0.0")])
+def test_a_task_with_other_rewards_is_refused_before_any_job(tmp_path, capsys, task, reward):
+    assert count(tmp_path / "out", base=["--task", f"other={MODULE}:{task}", *LINE[2:]]) == 1
+    said = capsys.readouterr().err
+    assert f"--task other: task other gave a reward of {reward}" in said
+    assert "expected -1 in every step" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_reward_that_is_no_number_later_on_fails_its_job(tmp_path, capsys):
+    base = ["--task", f"late={MODULE}:NotANumber", *LINE[2:]]
+    assert count(tmp_path, "--seeds", "1", "--limits", "1", base=base) == 1
+    assert "late 1 0 failed: NotMinimumTimeError: task late gave a reward of nan in step 2" in capsys.readouterr().err
+
+
+def test_a_task_that_ends_at_once_is_said_to_be_trivial(tmp_path, capsys):
+    assert count(tmp_path, "--seeds", "1", base=["--task", f"at_once={MODULE}:AtOnce", *LINE[2:]]) == 0
+    said = capsys.readouterr().out
+    assert "at_once is trivial: under 1 step the untrained policy reaches the goal every 1.0 steps." in said
+    assert "Check the task's termination" in said
+    assert "1 steps" not in said
+
+
+def test_an_output_folder_that_cannot_be_one_is_named_with_its_option(tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    for out in (tmp_path / "file", tmp_path / "file" / "inside"):
+        assert count(out, "--seeds", "1") == 1
+        said = capsys.readouterr().err
+        assert f"error: --out {out}: " in said
+        assert "choose another folder with --out" in said
 
 
 def test_a_goal_that_is_never_reached_gives_zeros(tmp_path):

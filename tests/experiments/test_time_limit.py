@@ -56,6 +56,31 @@ def test_a_goal_that_is_never_reached_is_not_to_be_tried(tmp_path):
     assert "Admissible limits: none for certain\n" in text
 
 
+@pytest.mark.parametrize(
+    ("task", "reason"),
+    [
+        ("AtOnce", "from 100 % of the starts a single step suffices"),
+        (
+            "Autopilot",
+            "every 4.0 steps, resets included, and the search knows no ways that are much shorter: 4.0 steps",
+        ),
+    ],
+)
+def test_a_task_whose_goal_comes_whatever_is_done_gets_no_limit(tmp_path, task, reason):
+    assert ask(tmp_path, task, "--limits", "1", "5", "20") == 0
+    text = answer(tmp_path)
+    assert "Recommended time limit: none; the task is trivial as it is" in text
+    assert reason in text
+    assert "Check the task's termination" in text
+    assert "1 steps" not in text
+
+
+def test_a_task_with_other_rewards_is_refused(tmp_path, capsys):
+    assert ask(tmp_path / "out", "Generous", "--limits", "20") == 1
+    assert "expected -1 in every step" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_task_that_breaks_gives_no_answer_but_the_reason(tmp_path, capsys):
     assert ask(tmp_path, "Fragile", "--limits", "1", "10") == 1
     said = capsys.readouterr().err

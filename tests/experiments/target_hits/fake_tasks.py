@@ -126,3 +126,46 @@ class Fragile(Line):
         super().begin_attempt()
         if self.log.count("attempt") == 5:
             raise RuntimeError("the gripper came off")
+
+
+class AtOnce(Line):
+    """The goal is reached in the first step from everywhere."""
+
+    def _at_goal(self):
+        return True
+
+
+class Autopilot(Line):
+    """The goal is reached in the 4th step from everywhere, whatever is done."""
+
+    def _start(self):
+        super()._start()
+        self._left = 4
+
+    def _live_a_cycle(self):
+        self._left -= 1
+
+    def _at_goal(self):
+        return self._left == 0
+
+
+class Generous(Line):
+    """Rewards being near the goal."""
+
+    def outcome(self):
+        return replace(super().outcome(), reward=1.0 / (1.0 + abs(self.position)))
+
+
+class NotANumber(Line):
+    """Its reward is NaN, but only once it has been reset for the first time."""
+
+    def outcome(self):
+        return replace(super().outcome(), reward=float("nan") if "attempt" in self.log else -1.0)
+
+
+class Prize(Line):
+    """The goal costs nothing."""
+
+    def outcome(self):
+        outcome = super().outcome()
+        return replace(outcome, reward=0.0 if outcome.terminated else -1.0)

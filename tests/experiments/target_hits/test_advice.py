@@ -64,6 +64,28 @@ def test_limits_that_are_all_too_short_give_no_recommendation_but_where_to_look(
     assert why.endswith(advised)
 
 
+def test_a_trivial_task_gets_no_limit_but_what_to_check():
+    text = words({1: around(9000), 50: around(18000)}, (1,) * 60)
+    assert paragraph(text, "Recommended time limit:") == "none; the task is trivial as it is"
+    assert paragraph(text, "Admissible limits:") == "of no importance"
+    assert paragraph(text, "Minimum steps:").startswith(
+        "1 step (0.1 s): whoever knows the way reaches the goal within it"
+    )
+    why = paragraph(text, "Why:")
+    # 20 000 steps with 18 000 hits
+    assert why.startswith(
+        "from 100 % of the starts a single step suffices, so there is no time to save; under 50 steps"
+    )
+    assert "every 1.1 steps, resets included" in why
+    assert "Check the task's termination" in why
+
+
+def test_a_single_limit_is_spoken_of_as_one():
+    assert "the limit with enough hits (5) is too short. 5 is below" in words({5: around(50)}, (30,) * 60)
+    assert "the limit that was tried is below the minimum steps (30)" in words({5: around(3)}, (30,) * 60)
+    assert "the most are 3.0, at 1 step." in words({1: around(3)}, (1,) * 10)
+
+
 @pytest.mark.parametrize(
     ("hits", "starts", "reason"),
     [

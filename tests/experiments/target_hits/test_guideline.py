@@ -96,6 +96,21 @@ def test_a_search_that_finds_too_few_ways_recommends_nothing():
     assert (found.answer, found.limit) == (Answer.TOO_SHORT, None)
 
 
+def test_a_goal_that_comes_whatever_is_done_is_trivial():
+    # 2000 hits in 20 000 steps are 10 steps from hit to hit: 1.25 times the 8 that are known. 1900 are 10.5.
+    found = verdict({5: around(4000), 10: around(2000), 50: around(1500)})
+    assert (found.answer, found.limit) == (Answer.TRIVIAL, 10)
+    assert verdict({5: around(4000), 10: around(1900), 50: around(1500)}).answer is Answer.USE
+    # Under a limit that is too short, hits are lucky starts and nothing can be told from them.
+    assert verdict({1: around(1900), 5: around(4000), 50: around(1500)}).answer is Answer.USE
+
+
+def test_a_goal_one_step_away_is_trivial_if_it_is_hit_at_all():
+    assert verdict({1: around(500), 10: around(900)}, starts((55, 1), (5, None))).answer is Answer.TRIVIAL
+    assert verdict({1: around(500), 10: around(900)}, starts((60, 2))).answer is Answer.USE
+    assert verdict({1: (0,) * 5, 10: (0,) * 5}, starts((60, 1))).answer is Answer.DO_NOT_TRY
+
+
 # ---------------------------------------------------------------------- when to stop looking
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from experiments.target_hits.figure import draw_hits
 from experiments.target_hits.jobs import HitCount, hit_counts
-from experiments.target_hits.table import Cell, cells, csv_text, standard_error, table_text
+from experiments.target_hits.table import Cell, cells, csv_text, notes, standard_error, table_text
 
 COUNTS = [HitCount("dot", 10, 0, 4), HitCount("dot", 10, 1, 8), HitCount("dot", 100, 0, 7)]
 
@@ -37,6 +37,18 @@ def test_the_table_shows_each_cell_and_how_many_seeds_are_behind_it():
         "              10 steps     6.0 ± 2.0 (2)",
         "             100 steps     7.0 ±   - (1)",
     ]
+
+
+def test_one_step_is_no_steps_and_stays_in_its_column():
+    lines = table_text(cells([HitCount("dot", 1, 0, 4), HitCount("dot", 10, 0, 4)]), 20_000).splitlines()
+    assert lines[-2:] == ["               1 step      4.0 ±   - (1)", "              10 steps     4.0 ±   - (1)"]
+
+
+def test_a_task_whose_goal_comes_in_every_other_step_is_called_trivial():
+    # 150 hits in 200 steps are 1.33 steps each; 100 are 2.
+    of = cells([HitCount("near", 1, 0, 120), HitCount("near", 2, 0, 150), HitCount("far", 1, 0, 100)])
+    (note,) = notes(of, 200)
+    assert note.startswith("near is trivial: under 2 steps the untrained policy reaches the goal every 1.3 steps.")
 
 
 @pytest.mark.parametrize("tasks", [1, 2, 5])
