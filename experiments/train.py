@@ -11,18 +11,20 @@ import argparse
 import contextlib
 import logging
 import shutil
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, NoReturn
 
 import tomli_w
 
 from common import topics
-from common.algorithms import ALGORITHMS
+from common.algorithms import ALGORITHMS, load_algorithm
 from common.codec import decode
 from common.config import to_tables
 from common.errors import ConfigError, RelodError, ServiceError
@@ -40,6 +42,7 @@ from deploy.run_file import IN_PROCESS, RunFile, versions
 from deploy.stop_signals import INTERRUPTED, StopSignals
 from deploy.summary import read_record, summarise, write_curve, write_summary
 from deploy.summary_text import summary_text
+from experiments.command_line import exit_code
 from experiments.simulation import SimulatedClock, SimulatedNetwork
 
 logger = logging.getLogger(__name__)
@@ -71,9 +74,10 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
     Args:
         training: what to train; its folder must be empty or not there yet.
         console: where progress and the summary are shown; None: nowhere.
-        stop: ends the run early, with a complete record.
+        stop: ends the run early, with a complete record. For the main thread.
 
     Raises:
+        KeyboardInterrupt: stopped before anything was begun or written.
         ConfigError: an option or setting is not what it can be.
         ServiceError: one of the services failed.
     """
@@ -82,6 +86,9 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
         raise ConfigError(f"--run-dir {run_dir}: expected a folder that is empty or not there yet")
     is_new = not run_dir.exists()
     configurations = _configurations(training)
+    if stop:
+        with _interruptible(stop):
+            _load_libraries(configurations[LEARNER].algorithm.name)
     _write_configurations(training, configurations)
     steps = configurations[ROBOT_BRIDGE].robot_bridge.steps
     reader = ProgressReader(run_dir, steps)
@@ -114,6 +121,39 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
         for path in paths:
             console.line(str(path))
     return summary.values
+
+
+@contextlib.contextmanager
+def _interruptible(stop: StopSignals) -> Iterator[None]:
+    """Have signals that ask to stop raise KeyboardInterrupt in the middle of what is done: there is nothing to keep."""
+    if stop.asked:
+        raise KeyboardInterrupt
+    came = False
+
+    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+        nonlocal came
+        came = True
+        raise KeyboardInterrupt
+
+    previous = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+    if came:  # In a place from which Python lets no exception out.
+        raise KeyboardInterrupt
+
+
+def _load_libraries(algorithm: str) -> None:
+    """Import what takes most of a run's start: torch, and what it imports itself for its first optimiser.
+
+    The services would do so in threads of their own, where nothing can interrupt it.
+    """
+    load_algorithm(algorithm)
+    import torch
+
+    torch.optim.Adam([torch.zeros(1)])
 
 
 class _Simulation:
@@ -287,17 +327,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Train from the command line; return the exit code."""
     training = _parse(arguments)
     console = Console()
-    with StopSignals() as stop:
-        try:
+
+    def run() -> int:
+        with StopSignals() as stop:
             console.line(f"run directory: {training.run_dir}")
             train(training, console, stop)
-        except RelodError as error:
-            console.error(f"experiments.train: error: {error}")
-            return 1
-        except OSError as error:
-            console.error(f"experiments.train: error: {error.filename or training.run_dir}: {error.strerror}")
-            return 1
-    return INTERRUPTED if stop.asked else 0
+        return INTERRUPTED if stop.asked else 0
+
+    return exit_code("experiments.train", "--run-dir", training.run_dir, console, run)
 
 
 if __name__ == "__main__":
