@@ -11,20 +11,18 @@ import argparse
 import contextlib
 import logging
 import shutil
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
 
 import tomli_w
 
 from common import topics
-from common.algorithms import ALGORITHMS, load_algorithm
+from common.algorithms import ALGORITHMS
 from common.codec import decode
 from common.config import to_tables
 from common.errors import ConfigError, RelodError, ServiceError
@@ -43,6 +41,7 @@ from deploy.stop_signals import INTERRUPTED, StopSignals
 from deploy.summary import read_record, summarise, write_curve, write_summary
 from deploy.summary_text import summary_text
 from experiments.command_line import exit_code
+from experiments.loading import load_libraries
 from experiments.simulation import SimulatedClock, SimulatedNetwork
 
 logger = logging.getLogger(__name__)
@@ -87,8 +86,7 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
     is_new = not run_dir.exists()
     configurations = _configurations(training)
     if stop:
-        with _interruptible(stop):
-            _load_libraries(configurations[LEARNER].algorithm.name)
+        load_libraries(configurations[LEARNER].algorithm.name, stop)
     _write_configurations(training, configurations)
     steps = configurations[ROBOT_BRIDGE].robot_bridge.steps
     reader = ProgressReader(run_dir, steps)
@@ -121,39 +119,6 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
         for path in paths:
             console.line(str(path))
     return summary.values
-
-
-@contextlib.contextmanager
-def _interruptible(stop: StopSignals) -> Iterator[None]:
-    """Have signals that ask to stop raise KeyboardInterrupt in the middle of what is done: there is nothing to keep."""
-    if stop.asked:
-        raise KeyboardInterrupt
-    came = False
-
-    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
-        nonlocal came
-        came = True
-        raise KeyboardInterrupt
-
-    previous = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-    if came:  # In a place from which Python lets no exception out.
-        raise KeyboardInterrupt
-
-
-def _load_libraries(algorithm: str) -> None:
-    """Import what takes most of a run's start: torch, and what it imports itself for its first optimiser.
-
-    The services would do so in threads of their own, where nothing can interrupt it.
-    """
-    load_algorithm(algorithm)
-    import torch
-
-    torch.optim.Adam([torch.zeros(1)])
 
 
 class _Simulation:

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -101,51 +100,13 @@ def test_a_stop_ends_the_run_early_with_a_whole_record(tmp_path):
     assert values["service_failures"] == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("where", ["in the middle of an import", "in the end of an object"])
-def test_a_stop_while_libraries_are_loaded_ends_at_once_and_leaves_nothing(
-    number, where, tmp_path, monkeypatch, capsys
-):
-    class EndsInterrupted:
-        def __del__(self):
-            os.kill(os.getpid(), number)
-            time.monotonic()  # Here Python handles the signal; what that raises gets no further.
-
-    def load(algorithm):
-        if where == "in the end of an object":
-            with monkeypatch.context() as patch:
-                patch.setattr(sys, "unraisablehook", lambda unraisable: None)
-                EndsInterrupted()
-        else:
-            os.kill(os.getpid(), number)
-            raise AssertionError("it went on")
-
-    monkeypatch.setattr("experiments.train._load_libraries", load)
-    before = signal.getsignal(number)
+def test_a_stop_before_anything_is_begun_leaves_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("experiments.loading.load_algorithm", lambda name: os.kill(os.getpid(), signal.SIGINT))
     assert main(["--task", "dot_reacher", "--run-dir", str(tmp_path / "run")]) == 130
     said = capsys.readouterr()
     assert "interrupted before anything was begun" in said.out
     assert not said.err
     assert not (tmp_path / "run").exists()
-    assert signal.getsignal(number) is before
-
-
-def test_what_takes_long_to_load_is_loaded_where_it_can_be_interrupted():
-    """In a process of its own: the services find torch, and what torch imports for its optimisers, loaded."""
-    program = """
-import sys, types
-from experiments import train
-train._load_libraries("sac")
-before = set(sys.modules)
-import torch
-from common.algorithms.adam import Adam
-from common.algorithms.sac import SAC
-parameter = torch.nn.Parameter(torch.zeros(3))
-Adam({"one": parameter}, 1e-3, (0.9, 0.999)).minimise(parameter.sum())
-print(sorted(name for name in set(sys.modules) - before if name.partition(".")[0] == "torch"))
-"""
-    result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, capture_output=True, text=True)
-    assert result.stdout.strip() == "[]"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,57 @@
+"""What takes most of a run's start, done where Ctrl-C can end it."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Iterator
+from types import FrameType
+from typing import NoReturn
+
+from common.algorithms import load_algorithm
+from deploy.stop_signals import StopSignals
+
+
+def load_libraries(algorithm: str, stop: StopSignals) -> None:
+    """Import torch, and what torch imports itself for its first optimiser, for an algorithm.
+
+    The services would do so in threads of their own, where nothing can interrupt it. For the main thread.
+
+    Args:
+        algorithm: its name.
+        stop: entered; what it would note ends this call instead, in the middle of what it does.
+
+    Raises:
+        KeyboardInterrupt: stopped, before or meanwhile.
+    """
+    if stop.asked:
+        raise KeyboardInterrupt
+    with _interruptible():
+        _load(algorithm)
+
+
+def _load(algorithm: str) -> None:
+    load_algorithm(algorithm)
+    import torch
+
+    torch.optim.Adam([torch.zeros(1)])
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """Have signals that ask to stop raise KeyboardInterrupt."""
+    came = False
+
+    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+        nonlocal came
+        came = True
+        raise KeyboardInterrupt
+
+    previous = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+    if came:  # In a place from which Python lets no exception out.
+        raise KeyboardInterrupt
