@@ -28,12 +28,21 @@ logger = logging.getLogger(__name__)
 _QUEUE_LENGTH = 20_000
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Replace ``path`` in one step: a reader sees the old text or the new one, never a piece."""
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Replace ``path`` in one step: a reader sees the old content or the new one, never a piece.
+
+    Raises:
+        OSError: it cannot be written; nothing is left of the attempt, which may have filled the disk.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
+    try:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        temporary.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
 
 
 def read_parts(directory: Path, service: str = "*") -> list[dict[str, Any]]:
@@ -77,6 +86,8 @@ class RunRecord:
         self.directory = directory
         self.dropped = 0
         """Entries that were not written, because the queue was full or the disk refused."""
+        self.part_error: str | None = None
+        """Why the newest part could not be written, if it could not."""
         self._service, self._incarnation = service, incarnation
         self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(_QUEUE_LENGTH)
         self._tables: dict[str, _Table] = {}
@@ -99,7 +110,7 @@ class RunRecord:
         """Replace this incarnation's part."""
         path = self.directory / "parts" / f"{self._service}-{self._incarnation}.json"
         content = {"service": self._service, "incarnation": self._incarnation, "pid": os.getpid(), **values}
-        self._put(lambda: write_atomically(path, _part_text(content)))
+        self._put(lambda: self._write_part(path, content))
 
     def row(self, table: str, values: Mapping[str, Any]) -> None:
         """Append a row to ``RUN_DIR/<table>.csv``; new columns are added to the table."""
@@ -133,6 +144,14 @@ class RunRecord:
             self.dropped += 1
             if self.dropped == 1:
                 logger.error("%s: the record cannot be written: %s", self.directory, error)
+
+    def _write_part(self, path: Path, content: Mapping[str, Any]) -> None:
+        try:
+            write_atomically(path, _part_text(content))
+        except OSError as error:
+            self.part_error = f"{path}: {error.strerror}"
+            raise
+        self.part_error = None
 
     def _write_row(self, table: str, row: Mapping[str, Any]) -> None:
         if table not in self._tables or not row.keys() <= set(self._tables[table].columns):

@@ -107,6 +107,8 @@ def _run(name: str, config: Any, serve: Callable[[Service, Any], None]) -> int:
         logger.info("%s has ended", name)
     if service.failure:
         raise ServiceError(service.failure)
+    if service.record.part_error:
+        raise ServiceError(f"the end of this service is not in the run's record: {service.record.part_error}")
     return 0
 
 

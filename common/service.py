@@ -165,9 +165,12 @@ class Service:
         return peer.status.counters.get(name, 0.0) if peer else 0.0
 
     def query_spec(self) -> TaskSpec | None:
-        """Ask the bridge what the task looks like until it answers; None if asked to stop first."""
+        """Ask the bridge what the task looks like until it answers; None if stopped, or the run is over, first."""
         warned_ns = self.clock.now_ns()
         while not self.stopping.is_set():
+            if self._finished is not None:
+                logger.info("the run finished before this service had begun")
+                return None
             asked_ns = self.clock.now_ns()
             payload = self.transport.query(topics.SPEC)
             if payload is not None:

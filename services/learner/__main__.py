@@ -14,9 +14,13 @@ from services.learner.config import LearnerConfig
 
 logger = logging.getLogger(__name__)
 
+NOTHING_LEARNT = {"updates": 0.0, "policy_pushes": 0.0, "policy_version": 0.0}
+"""Counts of a learner that has not begun: importing torch takes seconds, and the run may be over before."""
+
 
 def serve(service: Service, config: LearnerConfig) -> None:
     """Learn from the bridge what the task is, build the algorithm, update."""
+    service.counters = NOTHING_LEARNT.copy
     settings, name = config.learner, config.algorithm.name
     # Before torch is imported, which takes seconds of computing: not even that may delay the bridge.
     os.nice(settings.nice)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import logging
-import os
 import threading
 from pathlib import Path
 from zipfile import BadZipFile
@@ -15,6 +14,7 @@ from common.algorithms.base import Algorithm, Arrays
 from common.codec import encode
 from common.errors import ConfigError
 from common.messages import PolicyWeights
+from common.record import write_atomically
 
 logger = logging.getLogger(__name__)
 
@@ -27,6 +27,8 @@ class CheckpointWriter:
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
+        self.failure: str | None = None
+        """Why the newest checkpoint could not be written, if it could not."""
         self._wake = threading.Condition()
         self._pending: tuple[PolicyWeights, Arrays] | None = None
         self._stopping = False
@@ -56,12 +58,14 @@ class CheckpointWriter:
                 return
             weights, state = pending
             try:
-                _replace(self._directory / POLICY_FILE, encode(weights))
+                write_atomically(self._directory / POLICY_FILE, encode(weights))
                 buffer = io.BytesIO()
                 np.savez(buffer, **{_VERSION_KEY: np.int64(weights.version)}, **state)  # type: ignore[arg-type]
-                _replace(self._directory / CHECKPOINT_FILE, buffer.getvalue())
+                write_atomically(self._directory / CHECKPOINT_FILE, buffer.getvalue())
+                self.failure = None
             except OSError as error:
-                logger.error("%s: the checkpoint cannot be written: %s", self._directory, error)
+                self.failure = f"{self._directory}: the checkpoint cannot be written: {error.strerror}"
+                logger.error("%s", self.failure)
 
 
 def restore(directory: Path, algorithm: Algorithm) -> int:
@@ -78,9 +82,3 @@ def restore(directory: Path, algorithm: Algorithm) -> int:
         raise ConfigError(f"{path}: cannot go on from this checkpoint: {error}; remove it to begin anew") from error
     logger.info("going on from update %d, policy version %d", algorithm.updates, version)
     return version
-
-
-def _replace(path: Path, content: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_bytes(content)
-    temporary.replace(path)

@@ -124,6 +124,8 @@ class Learner:
             self._source.stop()
             self._pusher.close()
             self._checkpoints.close()
+        if service.failure is None:
+            service.failure = self._checkpoints.failure
 
     def counters(self) -> dict[str, float]:
         """Counts and losses for the heartbeat and the record."""

@@ -98,17 +98,20 @@ def test_a_reader_never_sees_a_piece_of_a_file(tmp_path):
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_a_file_that_cannot_be_written_keeps_its_old_text(tmp_path, monkeypatch):
+def test_a_file_that_cannot_be_written_keeps_its_old_text_and_leaves_nothing_beside(tmp_path, monkeypatch):
     path = tmp_path / "part.json"
     write_atomically(path, "old")
+    write_bytes = Path.write_bytes
 
-    def refuse(self, text, encoding):
+    def write_half(self, data):
+        write_bytes(self, data[: len(data) // 2])
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_text", refuse)
+    monkeypatch.setattr(Path, "write_bytes", write_half)
     with pytest.raises(OSError, match="No space left"):
         write_atomically(path, "new")
     assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_parts_are_read_oldest_incarnation_first(tmp_path):
@@ -276,6 +279,16 @@ def test_the_record_goes_on_when_the_disk_takes_again(started, tmp_path, monkeyp
     record.close()
     assert read_parts(tmp_path)[0]["state"] == "kept"
     assert record.dropped == 1
+    assert record.part_error is None
+
+
+def test_a_last_part_that_the_disk_refuses_is_known(started, tmp_path, monkeypatch):
+    monkeypatch.setattr(record_module, "write_atomically", refuse)
+    record = started()
+    record.part({"state": "stopped"})
+    record.close()
+    assert record.part_error is not None
+    assert "No space left on device" in record.part_error
 
 
 def test_a_folder_that_is_a_file_refuses_everything(started, tmp_path):

@@ -399,6 +399,16 @@ def test_waiting_for_the_bridge_ends_when_the_service_is_stopped(scene):
     assert results == [None]
 
 
+def test_a_run_that_is_over_has_no_task_to_wait_for(scene):
+    """The bridge is gone, or soon will be: a service that took long to start would wait for ever."""
+    learner = scene.service("learner")
+    scene.say(status("robot_bridge", incarnation=5))
+    heard(learner, "robot_bridge")
+    with running(learner.query_spec) as results:
+        scene.say(Finished(5, 100, "steps"), topics.FINISHED)
+    assert results == [None]
+
+
 def test_a_missing_bridge_is_reported_now_and_then(scene, caplog):
     actor = scene.service("actor")
     with running(actor.query_spec):

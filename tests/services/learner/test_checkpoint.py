@@ -11,7 +11,7 @@ from common.algorithms.sac import SAC
 from common.errors import ConfigError
 from services.learner import checkpoint as checkpoints
 from services.learner.checkpoint import CHECKPOINT_FILE, POLICY_FILE, CheckpointWriter, restore
-from tests.helpers import TIMEOUT_S, make_spec
+from tests.helpers import TIMEOUT_S, eventually, make_spec
 
 SPEC = make_spec(camera=False)
 
@@ -99,7 +99,7 @@ def test_the_last_of_several_checkpoints_is_what_remains(tmp_path):
 
 
 def test_while_one_is_written_the_next_ones_replace_each_other(tmp_path, monkeypatch):
-    algorithm, replace = make_algorithm(), checkpoints._replace
+    algorithm, replace = make_algorithm(), checkpoints.write_atomically
     begun, go_on, written = threading.Event(), threading.Event(), []
 
     def slow_replace(path, content):
@@ -108,7 +108,7 @@ def test_while_one_is_written_the_next_ones_replace_each_other(tmp_path, monkeyp
         written.append(path.name)
         replace(path, content)
 
-    monkeypatch.setattr(checkpoints, "_replace", slow_replace)
+    monkeypatch.setattr(checkpoints, "write_atomically", slow_replace)
     writer = CheckpointWriter(tmp_path)
     writer.write(algorithm.policy_weights(1, "float32"), algorithm.state_dict())
     assert begun.wait(TIMEOUT_S)
@@ -122,9 +122,24 @@ def test_while_one_is_written_the_next_ones_replace_each_other(tmp_path, monkeyp
 
 def test_a_disk_that_cannot_be_written_is_logged_and_does_not_end_the_learner(tmp_path, caplog):
     algorithm = make_algorithm()
-    gone = tmp_path / "gone"
-    writer = CheckpointWriter(gone)
+    no_folder = tmp_path / "file"
+    no_folder.touch()
+    writer = CheckpointWriter(no_folder)
     writer.write(algorithm.policy_weights(1, "float32"), algorithm.state_dict())
     writer.close()
     assert "the checkpoint cannot be written" in caplog.text
-    assert not (gone / POLICY_FILE).exists()
+    assert writer.failure is not None
+    assert str(no_folder) in writer.failure
+
+
+def test_a_disk_that_takes_again_has_the_checkpoint(tmp_path):
+    algorithm, folder = make_algorithm(), tmp_path / "run"
+    folder.touch()
+    writer = CheckpointWriter(folder)
+    writer.write(algorithm.policy_weights(1, "float32"), algorithm.state_dict())
+    eventually(lambda: writer.failure, "the failure")
+    folder.unlink()
+    writer.write(algorithm.policy_weights(2, "float32"), algorithm.state_dict())
+    writer.close()
+    assert writer.failure is None
+    assert restore(folder, make_algorithm()) == 2
