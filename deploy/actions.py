@@ -6,7 +6,6 @@ All times are on the bridge's monotonic clock, which is also the emulated networ
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,10 +96,9 @@ def outage_ends(actions: ArrivedActions, network: NetworkPart, last_published_ns
     return ends
 
 
-def last_published_ns(actions: ArrivedActions, ring_published_ns: Sequence[int] | Int64Array) -> int:
-    """The newest publication that is known of: answered by an action, or persisted; 0 if none is."""
-    known = [int(np.max(values)) for values in (actions.published_ns, ring_published_ns) if len(values)]
-    return max(known, default=0)
+def last_published_ns(actions: ArrivedActions, persisted_ns: int) -> int:
+    """The newest publication that is known of: answered by an action, or of what was persisted; 0 if none is."""
+    return max(int(actions.published_ns.max()) if len(actions.published_ns) else 0, persisted_ns)
 
 
 def _seconds(nanoseconds: int) -> float:

@@ -25,11 +25,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from deploy.console import Console
         from deploy.options import parse_options
         from deploy.run import launch, write_configurations
+        from deploy.side import launch_side
 
         try:
             options = parse_options(arguments)
             if options.write_config:
                 return write_configurations(options, options.write_config)
+            if options.side:
+                return launch_side(options, options.side, stop, Console())
             return launch(options, stop, Console())
         except RelodError as error:
             print(f"deploy.launch: error: {error}", file=sys.stderr)

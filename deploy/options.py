@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import secrets
 from collections.abc import Mapping, Sequence
@@ -14,14 +15,18 @@ from typing import Any
 from common.algorithms import ALGORITHMS
 from common.config import read_toml
 from common.errors import ConfigError
+from common.topics import ROBOT_BRIDGE
+from deploy.computers import check_is_ours, check_pair, checked_address
 from deploy.hosts import host_names, load_host
-from deploy.network import PRESETS, NetworkConditions, load_network, parse_network
+from deploy.network import HOSTS, PRESETS, Host, NetworkConditions, load_network, parse_network
 from deploy.network.conditions import DIRECTIONS
 from deploy.placement import Placement, load_placement, mode_names
 from deploy.plan import RunRequest, split_overrides
 
 NO_NETWORK = "none"
 """Name of the network of a run on one host."""
+REAL_NETWORK = "real"
+"""Name of the network of a run on two computers."""
 
 HOST_BUDGET_HELP = f"what the learner's computer can do: {', '.join(host_names())}, or a TOML file with a table [host]"
 """Of the option that ``experiments.train`` has too."""
@@ -35,8 +40,23 @@ _EPILOG = """\
 examples:
   python -m deploy.launch local_only --task visual_dot_reacher
   python -m deploy.launch remote_local --task dot_reacher --network wifi_office --steps 5000
+  python -m deploy.launch local_only --task dot_reacher --host-budget jetson
   python -m deploy.launch local_only --task dot_reacher --set task.preset=thesis --set algorithm.batch_size=32
 """
+
+
+@dataclass(frozen=True)
+class Side:
+    """This computer's part in a run on two computers."""
+
+    host: Host
+    """Which of the two this computer is."""
+    addresses: Mapping[Host, str]
+    """Host -> the IPv4 address that its services listen on."""
+    run_id: str | None
+    """None: the one that ``local`` makes."""
+    wait_s: float
+    """Longest time to wait for the other computer's launcher, seconds."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +71,8 @@ class LaunchOptions:
     base_port: int | None
     write_config: Path | None
     """Only write the configurations to this folder."""
+    side: Side | None = None
+    """None: all services run on this computer."""
 
 
 def parse_options(arguments: Sequence[str] | None = None) -> LaunchOptions:
@@ -62,15 +84,22 @@ def parse_options(arguments: Sequence[str] | None = None) -> LaunchOptions:
     options = _parser().parse_args(arguments)
     placement = load_placement(options.mode)
     for_services, for_network = split_overrides(options.set)
-    network, conditions = choose_network(placement, options.network, for_network)
-    run_dir = options.run_dir or Path("runs") / default_run_name(
-        placement.mode, options.task, options.seed or 0, datetime.now()
-    )
+    side = _side(options, placement) if options.host else None
+    if options.endpoint and side is None:
+        raise ConfigError(f"--endpoint {options.endpoint[0]}: expected together with --host, which this computer is")
+    if side is None:
+        network, conditions = choose_network(placement, options.network, for_network)
+    elif options.network or for_network:
+        raise ConfigError("--network: with --host nothing is emulated, the network is the one between the computers")
+    else:
+        network, conditions = REAL_NETWORK, None
+    mode = f"{placement.mode}-{side.host}" if side else placement.mode
+    run_dir = options.run_dir or Path("runs") / default_run_name(mode, options.task, options.seed or 0, datetime.now())
     request = RunRequest(
         placement=placement,
         task=options.task,
         algorithm=options.algorithm,
-        run_id=make_run_id(datetime.now()),
+        run_id=options.run_id or make_run_id(datetime.now()),
         # Absolute: a service that is started again by hand may be started from elsewhere.
         run_dir=run_dir.absolute(),
         seed=options.seed,
@@ -80,7 +109,27 @@ def parse_options(arguments: Sequence[str] | None = None) -> LaunchOptions:
         overrides=tuple(for_services),
     )
     write_config = options.write_config.absolute() if options.write_config else None
-    return LaunchOptions(request, network, conditions, options.base_port, write_config)
+    return LaunchOptions(request, network, conditions, options.base_port, write_config, side)
+
+
+def _side(options: argparse.Namespace, placement: Placement) -> Side:
+    host: Host = options.host
+    if not placement.services_on(host):
+        raise ConfigError(f"--host {host}: in {placement.mode} all services are on {placement.host[ROBOT_BRIDGE]!r}")
+    if not placement.spans_hosts:
+        raise ConfigError(f"--host {host}: in {placement.mode} all services are on one computer; leave --host out")
+    if options.write_config:
+        raise ConfigError("--write-config: expected without --host, for the files name all services")
+    addresses = dict(placement.addresses)
+    for endpoint in options.endpoint:
+        name, equals, address = endpoint.partition("=")
+        if not equals:
+            raise ConfigError(f"--endpoint {endpoint}: expected HOST=ADDRESS, for example local=192.168.1.10")
+        addresses[name] = checked_address(name, address, f"--endpoint {endpoint}")
+    check_pair(addresses)
+    check_is_ours(host, addresses[host])
+    run_id = options.run_id or (make_run_id(datetime.now()) if host == HOSTS[0] else None)
+    return Side(host, addresses, run_id, options.wait)
 
 
 def choose_network(
@@ -150,7 +199,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--network",
         metavar="PRESET|FILE",
-        help=f"network between the hosts: {', '.join(PRESETS)}, or a TOML file with a table [network]",
+        help=f"emulated network between the hosts: {', '.join(PRESETS)}, or a TOML file with a table [network]",
     )
     parser.add_argument("--host-budget", metavar="HOST|FILE", help=HOST_BUDGET_HELP)
     parser.add_argument("--run-dir", type=Path, metavar="DIR", help="folder of the run's record (default: in runs/)")
@@ -167,5 +216,31 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="only write a configuration for each service to DIR, and print the four commands",
     )
-    parser.add_argument("--base-port", type=int, metavar="N", help="first of the run's 8 TCP ports")
+    parser.add_argument("--base-port", type=int, metavar="N", help="first of the run's 8 TCP ports (--host: 12)")
+    parser.add_argument("--run-id", metavar="ID", help="name of the run in its messages (default: date and chance)")
+    computers = parser.add_argument_group(
+        "two computers", "the same command on both, but for --host and --run-dir; see docs/two-computers.md"
+    )
+    computers.add_argument("--host", choices=HOSTS, help="start only the services of this host, which this computer is")
+    computers.add_argument(
+        "--endpoint",
+        action="append",
+        default=[],
+        metavar="HOST=ADDRESS",
+        help="IPv4 address of local or remote, where the mode file's [endpoints] do not say it; once for each",
+    )
+    computers.add_argument(
+        "--wait",
+        type=_seconds,
+        default=120.0,
+        metavar="S",
+        help="longest time to wait for the other computer's launcher (default: %(default).0f)",
+    )
     return parser
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected more than 0 seconds, got {text}")
+    return value

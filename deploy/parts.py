@@ -21,9 +21,18 @@ class RunParts:
     parts: tuple[Part, ...]
 
     @classmethod
-    def read(cls, run_dir: Path) -> RunParts:
-        """Return the parts that are there; a service that never got so far has none."""
-        return cls(tuple(part for part in read_parts(run_dir) if part.get("service") in SERVICES))
+    def read(cls, *record_dirs: Path) -> RunParts:
+        """Return the parts that are there; a service that never got so far has none.
+
+        Where several folders have a part of one incarnation, the one that was written last counts.
+        """
+        newest: dict[tuple[str, int], Part] = {}
+        for part in (part for folder in record_dirs for part in read_parts(folder)):
+            if part.get("service") in SERVICES:
+                known = newest.get((part["service"], part["incarnation"]))
+                if known is None or float(part.get("wall_s", 0.0)) > float(known.get("wall_s", 0.0)):
+                    newest[part["service"], part["incarnation"]] = part
+        return cls(tuple(sorted(newest.values(), key=lambda part: int(part["incarnation"]))))
 
     def of(self, service: str) -> list[Part]:
         """The parts of one service."""

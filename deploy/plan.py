@@ -15,6 +15,7 @@ from common.algorithms.presets import setting_names
 from common.config import Tables, build_config, parse_override, section_names
 from common.errors import ConfigError
 from common.topics import ACTOR, LEARNER, REPLAY, ROBOT_BRIDGE, SERVICES, Lane
+from deploy.computers import TwoComputers
 from deploy.hosts import Host
 from deploy.network import Crossing, NetworkConditions, NetworkLink
 from deploy.network.conditions import direction_from
@@ -40,14 +41,14 @@ NETWORK_SECTION = "network"
 """``--set network.key=value`` is not for a service but for the emulated network."""
 
 LIMITED_SOCKET_BUFFER_KIB = 128
-"""Send buffer where the network's rate is limited: what waits in a larger one is old when it arrives."""
+"""Send buffer where the network's rate is limited, or not known: what waits in a larger one is old when it arrives."""
 
 RESEND_SHARE = 0.2
 """Share of a limited network's rate that repairs of a stream may take."""
 
 _SET_ELSEWHERE = {
     "run.directory": "use --run-dir",
-    "run.id": "the launcher makes one for each run",
+    "run.id": "use --run-id",
     "transport.listen_real_time": "endpoints follow from the placement; use --base-port",
     "transport.listen_bulk": "endpoints follow from the placement; use --base-port",
     "transport.connect_real_time": "endpoints follow from the placement; use --base-port",
@@ -205,7 +206,8 @@ def _transport_table(
     conditions: NetworkConditions | None,
 ) -> dict[str, Any]:
     here = placement.host[service]
-    table: dict[str, Any] = {"socket_buffer_kib": LIMITED_SOCKET_BUFFER_KIB if _is_limited(conditions) else 0}
+    small = isinstance(network_link, TwoComputers) or _is_limited(conditions)
+    table: dict[str, Any] = {"socket_buffer_kib": LIMITED_SOCKET_BUFFER_KIB if small else 0}
     for lane in Lane:
         table[f"listen_{lane.value}"] = _endpoint(network_link.listen_address(here), ports.port(service, lane))
         table[f"connect_{lane.value}"] = [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,14 +39,26 @@ class Progress:
 class ProgressReader:
     """Reads the progress of one run."""
 
-    def __init__(self, run_dir: Path, steps_total: int, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._run_dir, self._steps_total, self._now_s = run_dir, steps_total, now_s
+    def __init__(
+        self,
+        run_dir: Path,
+        steps_total: int,
+        now_s: Callable[[], float] = time.monotonic,
+        other_dirs: Sequence[Path] = (),
+    ) -> None:
+        """Args:
+        run_dir: folder of the run's record, with the bridge's part.
+        steps_total: action cycles of the run.
+        now_s: monotonic time.
+        other_dirs: folders with the parts of services on another computer.
+        """
+        self._dirs, self._steps_total, self._now_s = (run_dir, *other_dirs), steps_total, now_s
         self._episodes = EpisodeTable(run_dir)
         self._first: tuple[float, int] | None = None
 
     def read(self) -> Progress:
         """Return where the run stands now."""
-        parts = RunParts.read(self._run_dir)
+        parts = RunParts.read(*self._dirs)
         episodes = self._episodes.update()
         newest = {service: parts.newest(service) for service in SERVICES}
         steps = int(parts.latest(ROBOT_BRIDGE, "steps") or 0)

@@ -1,6 +1,7 @@
-"""``python -m deploy.summary RUN_DIR``: makes ``summary.json`` and ``learning_curve.png`` from the services' parts.
+"""``python -m deploy.summary RUN_DIR [RUN_DIR ...]``: ``summary.json`` and ``learning_curve.png`` from a run's parts.
 
-What a run's record does not tell is null in the summary, with a warning: a run that was cut short has one too.
+A run on two computers leaves a folder on each; what is found in them is put together. What the record does not tell is
+null in the summary, with a warning: a run that was cut short has one too.
 """
 
 from __future__ import annotations
@@ -8,47 +9,22 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from common.errors import ConfigError, RelodError, RingError
-from common.messages import Int64Array
-from common.record import settle_parts, write_atomically
+from common.errors import RelodError
+from common.record import write_atomically
 from common.topics import ACTOR, LEARNER, ROBOT_BRIDGE
 from deploy import parts as run_parts
-from deploy.actions import ArrivedActions, last_published_ns, outage_ends
+from deploy.actions import last_published_ns, outage_ends
 from deploy.curve import draw_learning_curve
-from deploy.episodes import Episode, EpisodeTable, steps_per_goal
-from deploy.network import NetworkPart
-from deploy.parts import RunParts
-from deploy.run_file import IN_PROCESS, RunFile
+from deploy.episodes import Episode, steps_per_goal
+from deploy.run_file import IN_PROCESS
+from deploy.run_record import Record, read_record
 from deploy.summary_text import summary_text
 from deploy.traffic import bytes_per_key, network_link
-
-
-@dataclass(frozen=True)
-class RingContent:
-    """What the summary wants to know of the experience ring."""
-
-    duplicated: int
-    """Rows whose time step stands in an earlier row."""
-    published_ns: Int64Array
-    """(rows,) publication times of the time steps in the ring."""
-
-
-@dataclass
-class Record:
-    """Everything a run left behind; what is missing is None and has its warning."""
-
-    parts: RunParts
-    run: RunFile | None
-    episodes: list[Episode]
-    actions: ArrivedActions | None
-    ring: RingContent | None
-    network: NetworkPart | None
-    warnings: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -60,65 +36,6 @@ class Summary:
     episodes: list[Episode]
     has_goal: bool
     """Whether steps per goal mean something in this run."""
-
-
-def read_record(run_dir: Path) -> Record:
-    """Read a run's record; what killed services have left in memory is written into it first.
-
-    Raises:
-        ConfigError: there is no such folder.
-    """
-    if not run_dir.is_dir():
-        raise ConfigError(f"{run_dir}: no such run directory")
-    if not (run_dir / "run.toml").exists() and not (run_dir / "parts").is_dir():
-        raise ConfigError(f"{run_dir}: expected a run's record, with run.toml or parts/; there is neither")
-    warnings: list[str] = []
-
-    def attempt(read: Callable[[], Any]) -> Any:
-        try:
-            return read()
-        except (RelodError, OSError, ValueError, KeyError, TypeError) as error:
-            warnings.append(str(error))
-            return None
-
-    table = EpisodeTable(run_dir)
-    attempt(lambda: settle_parts(run_dir))
-    attempt(table.update)
-    actions = attempt(lambda: ArrivedActions.read(run_dir))
-    unreadable = table.unreadable + (actions.unreadable if actions else 0)
-    if unreadable:
-        warnings.append(f"{unreadable} rows of episodes.csv and actions.csv could not be read")
-    return Record(
-        parts=RunParts.read(run_dir),
-        run=attempt(lambda: RunFile.read(run_dir)),
-        episodes=table.episodes,
-        actions=actions,
-        ring=attempt(lambda: read_ring(run_dir / "ring")),
-        network=attempt(lambda: _read_network(run_dir)),
-        warnings=warnings,
-    )
-
-
-def read_ring(path: Path) -> RingContent:
-    """Count what stands twice in the experience ring.
-
-    Raises:
-        RingError: there is none, or it cannot be read.
-    """
-    import numpy as np
-
-    from common.frame_ring import RingReader
-
-    if not path.exists():
-        raise RingError(f"{path} is missing")
-    reader = RingReader(path)
-    try:
-        end = reader.rows_appended
-        rows = reader.read_rows(np.arange(max(0, end - reader.layout.capacity_rows), end))
-    finally:
-        reader.close()
-    identities = rows[["incarnation", "seq"]]
-    return RingContent(len(rows) - len(np.unique(identities)), rows["published_ns"].copy())
 
 
 def summarise(record: Record) -> Summary:
@@ -210,7 +127,7 @@ def _outages(record: Record, notes: list[str]) -> list[dict[str, float | None]] 
     if record.network is None or record.actions is None:
         # Without a network there are none; with one whose actions are unknown, nobody can say.
         return [] if record.run is not None and record.run.backend == "none" else None
-    last_ns = last_published_ns(record.actions, record.ring.published_ns if record.ring else [])
+    last_ns = last_published_ns(record.actions, record.ring.last_published_ns if record.ring else 0)
     ends = outage_ends(record.actions, record.network, last_ns)
     if any(end.first_action_s is None for end in ends):
         notes.append("first_action_s is null where the run ended before an action came")
@@ -222,12 +139,6 @@ def _network_link(record: Record) -> dict[str, Any] | None:
         return None
     parts, run = record.parts, record.run
     return network_link(run.backend, record.network, parts.bytes_sent(), parts.bytes_received(), run.placement)
-
-
-def _read_network(run_dir: Path) -> NetworkPart | None:
-    path = run_dir / "network.json"
-    # A run on one host has no network, and misses nothing.
-    return NetworkPart.read(path) if path.exists() else None
 
 
 def _count(value: float | None) -> int | None:
@@ -242,16 +153,22 @@ def _sum(*values: float | None) -> int | None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Summarise a run from the command line."""
     parser = argparse.ArgumentParser(prog="python -m deploy.summary", description="Summarise a run's record.")
-    parser.add_argument("run_dir", type=Path, metavar="RUN_DIR", help="folder of the run's record")
-    options = parser.parse_args(arguments)
+    parser.add_argument(
+        "run_dirs",
+        type=Path,
+        nargs="+",
+        metavar="RUN_DIR",
+        help="folder of the run's record; of a run on two computers, both folders. The summary goes into the first",
+    )
+    run_dirs = parser.parse_args(arguments).run_dirs
     try:
-        summary = summarise(read_record(options.run_dir))
-        paths = [write_summary(options.run_dir, summary), write_curve(options.run_dir, summary)]
+        summary = summarise(read_record(*run_dirs))
+        paths = [write_summary(run_dirs[0], summary), write_curve(run_dirs[0], summary)]
     except RelodError as error:
         print(f"deploy.summary: error: {error}", file=sys.stderr)
         return 1
     except OSError as error:
-        print(f"deploy.summary: error: {options.run_dir}: cannot be written: {error.strerror}", file=sys.stderr)
+        print(f"deploy.summary: error: {run_dirs[0]}: cannot be written: {error.strerror}", file=sys.stderr)
         return 1
     for warning in summary.warnings:
         print(f"deploy.summary: warning: {warning}", file=sys.stderr)

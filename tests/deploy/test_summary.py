@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.errors import ConfigError
 from common.frame_ring import RingWriter
 from deploy import summary
 from deploy.run_file import RunFile
-from deploy.summary import read_record, summarise
+from deploy.run_record import read_record
+from deploy.summary import summarise
 from deploy.summary_text import summary_text
 from tests.common.ring_cases import Bridge, task_spec
 from tests.deploy.hand_made_record import network_part, write_actions, write_episodes, write_part
@@ -181,23 +181,6 @@ def test_rows_that_stand_twice_in_the_ring_are_counted(tmp_path: Path) -> None:
     rows.flush()
     write_part(tmp_path, "robot_bridge", 7, counters={"produced": 2}, **BRIDGE)
     assert summarise(read_record(tmp_path)).values["experience"]["duplicated"] == 2
-
-
-def test_a_ring_that_has_wrapped_is_read_whole(tmp_path: Path) -> None:
-    bridge = Bridge(incarnation=7, camera=False)
-    ring = RingWriter.create_or_reopen(tmp_path / "ring", task_spec(camera=False), 10)
-    for _ in range(25):
-        ring.append(bridge.start())
-    ring.close()
-    content = summary.read_ring(tmp_path / "ring")
-    assert content.duplicated == 0
-    assert len(content.published_ns) == 10
-
-
-def test_a_folder_that_is_no_run_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"expected a run's record"):
-        read_record(tmp_path)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_missing_is_null_with_a_warning(tmp_path: Path) -> None:
