@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -111,17 +111,16 @@ def launch(options: LaunchOptions, stop: StopSignals, console: Console) -> int:
                 services, reader, run_dir, drawing, stop, console, early_end=early_end, report=console.error
             )
     # The network has been closed: its part of the record is final.
-    complete = summarise_run([run_dir], drawing, stop, console)
+    complete = summarise_run(run_dir, drawing, stop, console)
     if stop.asked:
         return INTERRUPTED
     return 0 if complete and not failures else 1
 
 
-def summarise_run(record_dirs: Sequence[Path], drawing: Drawing, stop: StopSignals, console: Console) -> bool:
-    """Write the summary of a run's record into its first folder, and show it; True if the record is complete."""
-    run_dir = record_dirs[0]
+def summarise_run(run_dir: Path, drawing: Drawing, stop: StopSignals, console: Console) -> bool:
+    """Write and show the summary; True if the record is complete."""
     try:
-        summary = summarise(read_record(*record_dirs))
+        summary = summarise(read_record(run_dir))
         for warning in summary.warnings:
             console.error(f"deploy.launch: warning: {warning}")
         console.line(summary_text(summary.values))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from common.transport import ZenohTransport
 from deploy.agreement import RELEASE, RUN_ID, differences, facts_of
 from deploy.computers import TwoComputers, other_host
 from deploy.console import Console
+from deploy.listener import INTERRUPTED_S, SILENT_S, Listener
 from deploy.mirror import write_ring_counts
 from deploy.network import HOSTS, Host
 from deploy.options import LaunchOptions, Side
@@ -26,18 +26,14 @@ from deploy.run import launched_services, run_file, summarise_run, write_tables
 from deploy.run_file import REPOSITORY
 from deploy.run_record import RING, read_record
 from deploy.stop_signals import INTERRUPTED, StopSignals
-from deploy.watch import OVERTIME_S, Drawing, EarlyEnd, watch
+from deploy.watch import OVERTIME_S, Drawing, watch
 
 SIDE_PORTS = PORTS + len(HOSTS) * len(Lane)
 """Ports of a run on two computers: the services', then those of the launchers themselves."""
 
 _POLL_S = 0.05
-_SILENT_S = 10.0
-"""The other launcher has not been heard of for so long: the user is told."""
 _TOLD_S = 2.0
 """Longest time that the other launcher may need for an answer or a file, once it has one."""
-_INTERRUPTED_S = 3.0
-"""After Ctrl-C there, the longest time in which the services here should have heard of the run's end."""
 _STOPPING_S = 5.0
 """Longest time that the other side needs to stop its services and settle its record."""
 
@@ -104,74 +100,15 @@ def _run(
     listener = Listener(other, console, robot_is_here=has_bridge, run_has_begun=lambda: reader.read().steps > 0)
     drawing = Drawing()
     failures = watch(services, reader, run_dir, drawing, stop, console, early_end=listener.early_end, report=report)
+    listener.note_end()
     outcome = "stopped by Ctrl-C" if stop.asked else "; ".join(failures) or "well"
     _leave_ring_counts(run_dir)
     other.tell(phase=ENDED, outcome=outcome, succeeded=not failures and not stop.asked)
     _exchange_records(other, listener, has_bridge, stop, console)
-    complete = summarise_run([run_dir, other.mirror.folder], drawing, stop, console)
+    complete = summarise_run(run_dir, drawing, stop, console)
     if stop.asked:
         return INTERRUPTED
     return 0 if complete and not failures else 1
-
-
-class Listener:
-    """Tells this side's user what comes from the other side, and judges whether the run can go on."""
-
-    def __init__(
-        self,
-        other: OtherSide,
-        console: Console,
-        *,
-        robot_is_here: bool,
-        run_has_begun: Callable[[], bool],
-        now_s: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._other, self._console, self._now_s = other, console, now_s
-        self._robot_is_here, self._run_has_begun = robot_is_here, run_has_begun
-        self._said = 0
-        self._silent = False
-        self._ended_s: float | None = None
-
-    def early_end(self) -> EarlyEnd | None:
-        """Say what is new; return why this side has to end, if it has to."""
-        self.listen()
-        news = self._other.news
-        if news is None or self._ended_s is None:
-            return None
-        there, since_s = self._other.there, self._now_s() - self._ended_s
-        if not self._run_has_begun():
-            return EarlyEnd(f"{there} has ended before the run had begun, and so it ends here, too", not news.succeeded)
-        limit_s = OVERTIME_S if news.succeeded else _INTERRUPTED_S
-        if not self._robot_is_here and since_s > limit_s:
-            return EarlyEnd(f"{there} ended {since_s:.0f} s ago, and some services here have not heard of it", False)
-        return None
-
-    def listen(self) -> None:
-        """Say what is new on the other side."""
-        news, there = self._other.news, self._other.there
-        if news is None:
-            return
-        for text in news.said[self._said :]:
-            self._console.error(f"{there}: {text}")
-        self._said = max(self._said, len(news.said))
-        if news.phase == ENDED and self._ended_s is None:
-            self._ended_s = self._now_s()
-            self._console.line("\n".join(self._ending(news)))
-        silent = self._other.silent_s > _SILENT_S
-        if silent != self._silent and news.phase != ENDED:
-            self._silent = silent
-            self._console.error(
-                f"the launcher on {there} has not answered for {_SILENT_S:.0f} s; the services here go on"
-                if silent
-                else f"the launcher on {there} answers again"
-            )
-
-    def _ending(self, news: News) -> list[str]:
-        lines = [f"{self._other.there} has ended: {news.outcome}"]
-        if self._robot_is_here and not news.succeeded and self._run_has_begun():
-            lines += ["  the services here go on, and the robot waits; end here with Ctrl-C, or start again there:"]
-            lines += [f"  {command}" for command in news.restart]
-        return lines
 
 
 def _agree(
@@ -250,15 +187,15 @@ def _exchange_records(
         ends_soon = has_bridge or there_ended
         if not ends_soon and news is not None and news.has_record:
             break
-        limit_s = _STOPPING_S + (_INTERRUPTED_S if stop.asked else OVERTIME_S) if ends_soon else _TOLD_S
-        if waited_s > limit_s or other.silent_s > _SILENT_S or (stop.asked and not stopped_before):
+        limit_s = _STOPPING_S + (INTERRUPTED_S if stop.asked else OVERTIME_S) if ends_soon else _TOLD_S
+        if waited_s > limit_s or other.silent_s > SILENT_S or (stop.asked and not stopped_before):
             break
         console.status(f"waiting for {other.there} to end, for its part of the record")
         time.sleep(_POLL_S)
-    if not other.has_record:
+    if listener.was_left_alone or not other.has_record:
         console.error(
-            f"deploy.launch: warning: the record of {other.there} is not complete here; when it has ended, copy its "
-            "run directory to this computer: python -m deploy.summary RUN_DIR ITS_COPY"
+            f"deploy.launch: warning: the record of {other.there} may not be complete here; when its services have "
+            "ended, copy its run directory to this computer: python -m deploy.summary RUN_DIR ITS_COPY"
         )
 
 
