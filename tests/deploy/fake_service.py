@@ -55,8 +55,9 @@ print(f"{name} says hello", flush=True)
 write_part("running")
 if behaviour in ("fail", "crash") and name != "robot_bridge":
     # In the middle of a run: whoever fails before the bridge has made a step has failed to start.
-    patience_s = time.monotonic() + 10.0
-    while time.monotonic() < patience_s and not list(run_dir.glob("parts/robot_bridge-*.json")):
+    patience_s = time.monotonic() + 30.0
+    # The bridge of a run on two computers is known by the copy of its part.
+    while time.monotonic() < patience_s and not list(run_dir.glob("**/parts/robot_bridge-*.json")):
         time.sleep(0.01)
 if behaviour in ("fail", "cannot start"):
     write_part("stopped", failure="the disk is full")
