@@ -16,6 +16,7 @@ from common.config import load_config
 from deploy import launch, run
 from deploy.console import Console
 from deploy.options import parse_options
+from deploy.placement import MODES
 from deploy.plan import CONFIG_CLASSES
 from deploy.stop_signals import INTERRUPTED, StopSignals
 
@@ -154,6 +155,18 @@ def test_write_config_writes_and_prints_what_to_type(tmp_path: Path, capsys: pyt
         assert config.run.directory == str(tmp_path / "run")
     assert "no emulated network" in printed
     assert sorted(path.name for path in (tmp_path / "configs").iterdir()) == sorted(f"{name}.toml" for name in SERVICES)
+
+
+def test_write_config_takes_the_addresses_of_the_mode_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mode = tmp_path / "lab.toml"
+    endpoints = '\n[endpoints]\nlocal = "192.0.2.1"\nremote = "192.0.2.2"\n'
+    mode.write_text((MODES / "remote_local.toml").read_text() + endpoints)
+    command = [str(mode), "--task", "dot_reacher", "--run-dir", str(tmp_path / "run")]
+    assert launch.main([*command, "--write-config", str(tmp_path / "configs")]) == 0
+    assert "127.0.0.1" not in capsys.readouterr().out
+    transport = load_config(CONFIG_CLASSES["replay"], tmp_path / "configs" / "replay.toml").transport
+    assert transport.listen_real_time.startswith("tcp/192.0.2.2:")
+    assert all(endpoint.startswith("tcp/192.0.2.1:") for endpoint in transport.connect_bulk)
 
 
 @pytest.mark.parametrize(

@@ -42,9 +42,26 @@ def test_a_placement_file_is_a_mode_of_its_name(tmp_path: Path) -> None:
     assert not placement.together("replay", "learner")
 
 
+SERVICES = '[services]\nrobot_bridge = "local"\nactor = "local"\nreplay = "remote"\nlearner = "remote"\n'
+
+
+def test_a_placement_file_may_say_where_its_hosts_are(tmp_path: Path) -> None:
+    placement = load_placement(
+        placement_file(tmp_path, SERVICES + '[endpoints]\nlocal = "192.168.1.10"\nremote = "192.168.1.20"\n')
+    )
+    assert placement.addresses == {"local": "192.168.1.10", "remote": "192.168.1.20"}
+    assert load_placement("remote_local").addresses == {}
+    assert placement.services_on("local") == ["robot_bridge", "actor"]
+    assert placement.services_on("remote") == ["replay", "learner"]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        (SERVICES + '[endpoints]\nrobot = "10.0.0.1"', r"\[endpoints\] robot = '10.0.0.1': unknown host 'robot'"),
+        (SERVICES + '[endpoints]\nlocal = "10.0.0"', r"\[endpoints\] local = '10.0.0': expected the computer's IPv4"),
+        (SERVICES + "[endpoints]\nlocal = 10", r"\[endpoints\] local = 10: expected the computer's IPv4"),
+        ("endpoints = 3\n" + SERVICES, "endpoints = 3: expected a table"),
         ('[services]\nrobot_bridg = "local"', r"unknown service 'robot_bridg'.*did you mean 'robot_bridge'"),
         ('[services]\nrobot_bridge = "laptop"', r"robot_bridge = 'laptop': expected one of local, remote"),
         ('[services]\nrobot_bridge = "local"\nactor = "local"', "no host for replay, learner"),
