@@ -133,7 +133,7 @@ def _agree(
             endpoints = ", ".join(f"{host} = {side.addresses[host]}" for host in HOSTS)
             listening = _launcher_ports(HOSTS[0], base_port)[Lane.REAL_TIME]
             raise ConfigError(
-                f"no launcher of {there!r} within {side.wait_s:.0f} s. Was `deploy.launch MODE --host {there}` started "
+                f"no launcher of {there!r} within {side.wait_s:g} s. Was `deploy.launch MODE --host {there}` started "
                 f"there, with the same endpoints ({endpoints}) and the same --base-port ({base_port})? Does a firewall "
                 f"let {HOSTS[1]} reach port {listening} of {HOSTS[0]}? --wait S waits longer"
             )

@@ -180,7 +180,7 @@ def test_a_launcher_that_nobody_answers_gives_up_and_says_what_to_look_at(
     assert launch.main(computers.command("remote", "--wait", "0.3")) == 1
     assert time.monotonic() - begun_s < 30.0
     said = capsys.readouterr().err
-    assert "no launcher of 'local' within 0 s" in said
+    assert "no launcher of 'local' within 0.3 s" in said
     assert f"local = 127.0.0.2, remote = 127.0.0.3) and the same --base-port ({computers.base_port})" in said
     assert f"port {computers.base_port + 8} of local" in said
     assert not computers.run_dir("remote").exists()
