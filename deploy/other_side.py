@@ -26,8 +26,8 @@ from deploy.network import Host
 
 LAUNCHERS_RUN = "launchers"
 """Second part of the launchers' keys, where services have their run's id: the sides have yet to agree on one."""
-POLL_S = 0.5
-"""Period of the questions."""
+POLL_S = 1.0
+"""Period of the questions: that of the parts."""
 _ANSWER_WITHIN_S = 2.0
 
 WAITING, RUNNING, ENDED = "waiting", "running", "ended"
@@ -61,7 +61,7 @@ class News:
 
 def launcher_topic(host: Host) -> Topic:
     """Return the query that the launcher on ``host`` answers."""
-    return Topic(f"launcher/{host}", News, (), (), Delivery.QUERY, Lane.REAL_TIME, "0.5 s")
+    return Topic(f"launcher/{host}", News, (), (), Delivery.QUERY, Lane.REAL_TIME, "1 s")
 
 
 class OtherSide:

@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from common.errors import ConfigError
-from deploy.ports import DEFAULT_BASE_PORT, reserved_ports
+from deploy.ports import DEFAULT_BASE_PORT, held_ports, reserved_ports
 
 
 def test_ports_are_consecutive_and_from_the_default_base_on() -> None:
@@ -42,4 +42,24 @@ def test_a_port_in_use_is_skipped_or_named() -> None:
 @pytest.mark.parametrize("base", [0, -1, 65530, 70000])
 def test_a_base_port_out_of_range_is_refused(base: int) -> None:
     with pytest.raises(ConfigError, match=f"--base-port {base}"), reserved_ports(8, base=base):
+        pass
+
+
+def test_ports_of_one_address_are_held_as_they_are_asked_for() -> None:
+    with reserved_ports(4) as free:
+        base = free[0]
+    with (
+        held_ports([base, base + 3], "127.0.0.2"),
+        held_ports([base + 1], "127.0.0.3"),
+        pytest.raises(ConfigError, match=f"use {base + 3}; choose another --base-port, on both computers"),
+        held_ports([base + 2, base + 3], "127.0.0.3"),
+    ):
+        pass
+    with socket.create_server(("127.0.0.2", base)), held_ports([base], "127.0.0.3"):
+        pass
+    with (
+        socket.create_server(("127.0.0.2", base)),
+        pytest.raises(ConfigError, match=f"another process listens on {base}"),
+        held_ports([base], "127.0.0.2"),
+    ):
         pass
