@@ -366,6 +366,14 @@ class PolicyWeights:
 
 
 @dataclass(frozen=True)
+class PolicyAcknowledgement:
+    """A policy has arrived at the actor, be it of use or not; tells the learner how long it was on its way."""
+
+    version: Annotated[int, Bounds(low=1)]
+    """Of the PolicyWeights."""
+
+
+@dataclass(frozen=True)
 class Status:
     """A service's heartbeat; who has sent none for a while counts as gone."""
 
@@ -426,6 +434,7 @@ MESSAGES: tuple[type, ...] = (
     RowMinibatch,
     ArrayMinibatch,
     PolicyWeights,
+    PolicyAcknowledgement,
     Status,
     Finished,
     Command,

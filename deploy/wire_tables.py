@@ -23,6 +23,7 @@ import common.service
 import common.transport
 import services.actor.forwarding
 import services.learner.minibatches
+import services.learner.policy_pushes
 import services.replay.minibatch_senders
 import services.replay.replay
 import services.robot_bridge.answers
@@ -93,6 +94,7 @@ CONSTANTS = (
     (services.replay.minibatch_senders, "LOST_AFTER_S"),
     (services.replay.replay, "ACTOR_LOST_AFTER_S"),
     (services.learner.minibatches, "CREDIT_S"),
+    (services.learner.policy_pushes, "ACKNOWLEDGED_WITHIN_S"),
     (services.robot_bridge.answers, "REMEMBERED_STEPS"),
     (services.robot_bridge.bridge, "REPUBLISH_NS"),
 )
@@ -103,7 +105,7 @@ SETTINGS: tuple[tuple[str, type, tuple[str, ...]], ...] = (
     ("robot_bridge", RobotBridgeSettings, ("journal_s", "journal_mib", "resend_kib_per_s")),
     ("actor", ActorSettings, ("journal_s", "journal_mib", "resend_kib_per_s", "lockstep_surplus")),
     ("replay", ReplaySettings, ("access", "max_surplus", "message_mib")),
-    ("learner", LearnerSettings, ("access", "prefetch")),
+    ("learner", LearnerSettings, ("access", "prefetch", "push_share")),
 )
 """Settings that a peer can notice: (section, its class, keys)."""
 

@@ -35,6 +35,7 @@ ENOUGH = {
     "credit": 3,
     "minibatch/arrays": 20,
     "policy": 5,
+    "policy/ack": 3,
     "status": 20,
 }
 """Messages to hear on each topic."""
