@@ -1,7 +1,7 @@
 """Reads a live run knowing nothing but ``docs/wire-format.md``, and holds it to every word there.
 
 Run outside the repository, beside the document and the files that stand in it (``client.py``, ``observation.py``,
-``policy.py``), with nothing importable but zenoh, msgpack, NumPy and zstd::
+``policy.py``), with nothing importable but zenoh, msgpack, NumPy, xxhash and zstd::
 
     python wire_listener.py DOCUMENT RUN ROBOT ENDPOINT ...
 
