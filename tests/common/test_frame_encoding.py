@@ -13,6 +13,7 @@ from common.codec import decode, encode
 from common.errors import MessageError
 from common.frame_encoding import EncodedFrames, FrameEncoding, digest_of, encode_frames, pixels_of
 from common.messages import Experience, TimeStep
+from services.robot_bridge.tasks import load_task
 from tests.helpers import make_experience, make_spec, make_time_step
 
 RAW, ZSTD, JPEG = FrameEncoding.RAW, FrameEncoding.ZSTD, FrameEncoding.JPEG444
@@ -270,3 +271,20 @@ def test_a_shape_without_a_task_that_claims_to_be_huge_does_no_harm(shape):
     fields["frames"] = ["zstd", shape, parts, digest_of(tuple(parts))]
     with pytest.raises(MessageError, match=r"TimeStep\.frames"):
         decode(msgpack.packb(fields), TimeStep)
+
+
+def test_an_experience_costs_little_beside_one_with_the_whole_stack():
+    task = load_task("visual_dot_reacher", pacing="lockstep", rng=np.random.default_rng(0))
+    task.advance_to(0)
+    task.begin_episode()
+
+    def size_of(count, encoding):
+        frames = np.concatenate([task.read().frames for _ in range(count)])
+        ids = np.arange(count)
+        step = make_time_step(1, frame_ids=ids, frame_capture_ns=ids, frames=encode_frames(frames, encoding))
+        return len(encode(make_experience(1, time_step=step)))
+
+    stack = size_of(task.spec.frame_stack, RAW)
+    assert size_of(1, RAW) <= 0.37 * stack
+    assert size_of(1, ZSTD) <= 0.06 * stack
+    assert size_of(1, JPEG) <= 0.12 * stack
