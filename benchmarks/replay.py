@@ -140,7 +140,7 @@ def fill_plain_replay(spec: TaskSpec, transitions: int) -> Any:
     before: tuple[Any, Experience] | None = None
     for experience in islice(recorded_experience(spec), _rows(transitions)):
         step = experience.time_step
-        stack = stacks.add(step, step.frame_ids, list(step.frames))
+        stack = stacks.add(step, step.frame_ids, list(step.pixels))
         assert stack is not None
         if before is not None and not step.is_first:
             replay.add(before[0], before[1].time_step, stack.frames, step)

@@ -3,7 +3,8 @@
 Not pickle: a pickle executes what a peer sends. A payload is one msgpack map: ``schema`` (version), ``message``
 (type name) and the message's fields; an array is ``[dtype, shape, raw little-endian bytes]``. Decoding checks type,
 shape, dtype, finiteness and bounds, so that what a service receives is safe to use as it is. Decoded arrays are
-read-only views of the received bytes: nothing is copied.
+read-only views of the received bytes: nothing is copied. Encoded camera frames keep their bytes, to be sent on
+unchanged, beside the pixels.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ import msgpack
 import numpy as np
 
 from common.errors import MessageError, SchemaVersionError
-from common.messages import MESSAGES, SCHEMA_VERSION, Array, Bounds, Dimensions
+from common.frame_encoding import EncodedFrames, FrameEncoding
+from common.messages import MESSAGES, SCHEMA_VERSION, Array, Bounds, CameraFrames, Dimensions
 
 Message = TypeVar("Message")
-Sizes = dict[str, int]
+Sizes = dict[str, Any]
+"""Values of :class:`Dimensions`, and of the letters that a message uses besides."""
 Decoder = Callable[[Any, str, Sizes], Any]
 
 _UNBOUNDED = Bounds()
@@ -49,7 +52,8 @@ def decode(payload: bytes, expected: type[Message], dimensions: Dimensions | Non
     Args:
         payload: bytes made by :func:`encode` of this or another implementation.
         expected: the type that belongs on the key expression the payload arrived on.
-        dimensions: sizes the arrays must have; None accepts any sizes that agree with each other.
+        dimensions: sizes the arrays must have, and the encoding of frames; None accepts any encoding, and any sizes
+            that agree with each other.
 
     Raises:
         SchemaVersionError: the sender speaks another schema version.
@@ -82,6 +86,8 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         contiguous = np.ascontiguousarray(value)
         return [value.dtype.str, list(value.shape), contiguous.data if contiguous.size else b""]
+    if isinstance(value, EncodedFrames):
+        return [value.encoding, value.shape, value.parts, value.digest]
     if isinstance(value, np.generic):
         return value.item()
     return vars(value)
@@ -137,6 +143,8 @@ def _decoder(hint: Any, bounds: Bounds = _UNBOUNDED) -> Decoder:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         inner, rule = arguments
+        if isinstance(rule, CameraFrames):
+            return _frames_decoder(np.dtype(rule.dtype), rule.shape)
         return _array_decoder(np.dtype(rule.dtype), rule.shape) if isinstance(rule, Array) else _decoder(inner, rule)
     if origin in (Union, types.UnionType):
         present = _decoder(next(a for a in arguments if a is not type(None)))
@@ -198,14 +206,7 @@ def _array_decoder(dtype: np.dtype[Any], shape: tuple[str | int, ...]) -> Decode
         sent_dtype, sent_shape, raw = value
         if sent_dtype != dtype.str:
             raise MessageError(f"{where}: expected dtype {dtype.str}, got {_shown(sent_dtype)}")
-        if not isinstance(sent_shape, list) or len(sent_shape) != len(shape):
-            raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {_shown(sent_shape)}")
-        for letter, size in zip(shape, sent_shape, strict=True):
-            if type(size) is not int or size < 0:
-                raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {_shown(sent_shape)}")
-            wanted = letter if isinstance(letter, int) else sizes.setdefault(letter, size)
-            if size != wanted:
-                raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {sent_shape}")
+        _check_shape(sent_shape, shape, where, sizes)
         if not isinstance(raw, bytes) or len(raw) != math.prod(sent_shape) * dtype.itemsize:
             raise MessageError(f"{where}: {sent_shape} of {dtype} do not fit the bytes that came")
         try:
@@ -217,6 +218,43 @@ def _array_decoder(dtype: np.dtype[Any], shape: tuple[str | int, ...]) -> Decode
         return result
 
     return decode_array
+
+
+def _frames_decoder(dtype: np.dtype[Any], shape: tuple[str | int, ...]) -> Decoder:
+    decode_raw = _array_decoder(dtype, shape)
+
+    def decode_frames(value: Any, where: str, sizes: Sizes) -> Any:
+        encoded = isinstance(value, list) and len(value) == 4
+        encoding = _enumeration(FrameEncoding, value[0], where) if encoded else FrameEncoding.RAW
+        announced = sizes.get("frame_encoding") or encoding
+        if encoding is not announced or (encoded and encoding is FrameEncoding.RAW):
+            raise MessageError(f"{where}: expected the run's encoding {announced.value!r}, got {encoding.value!r}")
+        if not encoded:
+            return decode_raw(value, where, sizes)
+        _, sent_shape, parts, digest = value
+        _check_shape(sent_shape, shape, where, sizes)
+        if not (isinstance(parts, list) and all(isinstance(part, bytes) for part in parts)):
+            raise MessageError(f"{where}: expected a list of encoded frames, got {_shown(parts)}")
+        frames = EncodedFrames(FrameEncoding(encoding), tuple(sent_shape), tuple(parts), _text(digest, where))
+        try:
+            _ = frames.pixels  # now, so that what cannot be decoded goes no further
+        except MessageError as error:
+            raise MessageError(f"{where}: {error}") from error
+        return frames
+
+    return decode_frames
+
+
+def _check_shape(sent_shape: Any, shape: tuple[str | int, ...], where: str, sizes: Sizes) -> None:
+    """Hold a shape that was sent against the declared one; letters that have no size yet get theirs."""
+    if not isinstance(sent_shape, list) or len(sent_shape) != len(shape):
+        raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {_shown(sent_shape)}")
+    for letter, size in zip(shape, sent_shape, strict=True):
+        if type(size) is not int or size < 0:
+            raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {_shown(sent_shape)}")
+        wanted = letter if isinstance(letter, int) else sizes.setdefault(letter, size)
+        if size != wanted:
+            raise MessageError(f"{where}: expected shape {_described(shape, sizes)}, got {sent_shape}")
 
 
 def _described(shape: tuple[str | int, ...], sizes: Sizes) -> str:

@@ -23,7 +23,9 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-SCHEMA_VERSION = 1
+from common.frame_encoding import FrameEncoding, Frames, pixels_of
+
+SCHEMA_VERSION = 2
 """Raised with every change that an older peer would misread."""
 
 Float32Array = npt.NDArray[np.float32]
@@ -55,6 +57,11 @@ class Array:
 
 
 @dataclass(frozen=True)
+class CameraFrames(Array):
+    """An array of camera frames, encoded as the TaskSpec says (:mod:`common.frame_encoding`)."""
+
+
+@dataclass(frozen=True)
 class Bounds:
     """Inclusive bounds of a finite number."""
 
@@ -68,7 +75,7 @@ Count = Annotated[int, Bounds(low=0, high=2**62)]
 
 @dataclass(frozen=True)
 class Dimensions:
-    """Sizes that arrays of a run's messages must have; from the TaskSpec."""
+    """Sizes that arrays of a run's messages must have, and how its frames travel; from the TaskSpec."""
 
     A: int
     P: int
@@ -76,6 +83,8 @@ class Dimensions:
     W: int
     C: int
     S: int
+    frame_encoding: FrameEncoding | None = None
+    """How the frames of TimeSteps must be encoded; None accepts every encoding."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +123,8 @@ class TaskSpec:
     """Action cycles that a reset after a time-out takes; counted into the episode (thesis 6.1)."""
     has_goal: bool
     """True if an attempt can terminate; steps per goal mean something only then."""
+    frame_encoding: FrameEncoding = FrameEncoding.RAW
+    """How the frames of all TimeSteps of the run travel."""
 
     @property
     def dimensions(self) -> Dimensions:
@@ -126,6 +137,7 @@ class TaskSpec:
             W=width,
             C=channels,
             S=self.frame_stack,
+            frame_encoding=self.frame_encoding,
         )
 
     @property
@@ -158,7 +170,7 @@ class TimeStep:
     """Consecutive ids of the camera frames that are new since the TimeStep before."""
     frame_capture_ns: Annotated[Int64Array, Array("int64", ("k",))]
     """Capture times of the new frames, bridge's monotonic clock."""
-    frames: Annotated[UInt8Array, Array("uint8", ("k", "H", "W", "C"))]
+    frames: Annotated[Frames, CameraFrames("uint8", ("k", "H", "W", "C"))]
     """The new camera frames, oldest first; channels are red, green, blue."""
     proprioception: Annotated[Float32Array, Array("float32", ("P",))]
     """Physical units of the task."""
@@ -180,6 +192,11 @@ class TimeStep:
     """Action cycles of the run so far, resets included."""
     acted_steps: Count
     """Action cycles of the run so far, without resets."""
+
+    @property
+    def pixels(self) -> UInt8Array:
+        """(k, H, W, C): ``frames`` as whoever receives them sees them."""
+        return pixels_of(self.frames)
 
     @property
     def is_first(self) -> bool:
@@ -349,6 +366,14 @@ class PolicyWeights:
 
 
 @dataclass(frozen=True)
+class PolicyAcknowledgement:
+    """A policy has arrived at the actor, be it of use or not; tells the learner how long it was on its way."""
+
+    version: Annotated[int, Bounds(low=1)]
+    """Of the PolicyWeights."""
+
+
+@dataclass(frozen=True)
 class Status:
     """A service's heartbeat; who has sent none for a while counts as gone."""
 
@@ -409,6 +434,7 @@ MESSAGES: tuple[type, ...] = (
     RowMinibatch,
     ArrayMinibatch,
     PolicyWeights,
+    PolicyAcknowledgement,
     Status,
     Finished,
     Command,

@@ -84,6 +84,7 @@ ARRAY_MINIBATCH = Topic(
     "minibatch/arrays", m.ArrayMinibatch, (REPLAY,), (LEARNER,), _NUMBERED, _BULK, "update", waits=True
 )
 POLICY = Topic("policy", m.PolicyWeights, (LEARNER,), (ACTOR,), _CACHED, _BULK, "push interval", waits=True)
+POLICY_ACK = Topic("policy/ack", m.PolicyAcknowledgement, (ACTOR,), (LEARNER,), _NEWEST, _REAL_TIME, "push")
 STATUS = Topic("status", m.Status, SERVICES, SERVICES, _NEWEST, _REAL_TIME, "0.2 s")
 FINISHED = Topic("finished", m.Finished, (ROBOT_BRIDGE,), (ACTOR, REPLAY, LEARNER), _NEWEST, _REAL_TIME, "end, 0.2 s")
 # fmt: on
@@ -103,6 +104,7 @@ TOPICS = (
     ROW_MINIBATCH,
     ARRAY_MINIBATCH,
     POLICY,
+    POLICY_ACK,
     STATUS,
     FINISHED,
 )

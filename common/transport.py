@@ -102,13 +102,14 @@ class ZenohTransport:
         zenoh, session = self._zenoh, self._sessions[topic.lane]
         key = topic.key(self._run.id, self._run.robot)
         if topic.delivery is Delivery.CACHED:
+            # Zenoh's recovery would tell of a message before a slow link has carried it: the subscriber asks for it
+            # again, gets it twice, and after a while nothing any more. Who joins again gets the newest as history.
             publisher = zenoh.ext.declare_advanced_publisher(
                 session,
                 key,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 priority=zenoh.Priority.DATA_LOW,
                 cache=zenoh.ext.CacheConfig(1),
-                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.5, sporadic_heartbeat=None),
                 publisher_detection=True,
             )
         else:
@@ -145,7 +146,6 @@ class ZenohTransport:
                 key,
                 handler,
                 history=zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True),
-                recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
                 subscriber_detection=True,
             )
         else:

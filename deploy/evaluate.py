@@ -19,6 +19,7 @@ import numpy as np
 from common.codec import decode
 from common.config import load_config
 from common.errors import ConfigError, MessageError, RelodError
+from common.frame_encoding import FrameEncoding, encode_frames, pixels_of
 from common.frame_stack import FrameStack
 from common.messages import Float32Array, PolicyWeights, UInt8Array
 from common.policies import Observation, Policy, policy_from_weights
@@ -61,14 +62,22 @@ class _StepIdentity:
 class Evaluation:
     """Runs episodes of a task with a policy."""
 
-    def __init__(self, task: Task, policy: Policy, rng: np.random.Generator, seed: int) -> None:
+    def __init__(
+        self,
+        task: Task,
+        policy: Policy,
+        rng: np.random.Generator,
+        seed: int,
+        encoding: FrameEncoding = FrameEncoding.RAW,
+    ) -> None:
         """Args:
         task: built with ``rng``, its only source of randomness.
         policy: what acts.
         rng: reset for each episode.
         seed: of the episodes' start states.
+        encoding: of the camera frames in the run; the policy sees what it leaves of them.
         """
-        self._task, self._policy, self._rng, self._seed = task, policy, rng, seed
+        self._task, self._policy, self._rng, self._seed, self._encoding = task, policy, rng, seed, encoding
         self._ledger = Ledger(task.spec)
         self._cycle_ns = round(task.spec.action_cycle_time_s * 1e9)
         self._now_ns = 0
@@ -124,7 +133,8 @@ class Evaluation:
         frames = None
         if self._stack:
             step = _StepIdentity(0, self._seq, self._ledger.attempt, self._ledger.step_index)
-            stack = self._stack.add(step, reading.frame_ids.tolist(), list(reading.frames))
+            pixels = pixels_of(encode_frames(reading.frames, self._encoding))
+            stack = self._stack.add(step, reading.frame_ids.tolist(), list(pixels))
             frames = np.stack(stack.frames) if stack else None
         self._seq += 1
         observation = Observation(frames, reading.proprioception, previous_action)
@@ -165,7 +175,8 @@ def load_run(run_dir: Path, config_path: Path | None, seed: int) -> tuple[Evalua
         raise ConfigError(f"{policy_path} is missing: the learner has not saved a policy") from None
     except MessageError as error:
         raise ConfigError(f"{policy_path} cannot be used: {error}") from error
-    return Evaluation(task, policy_from_weights(task.spec, weights), rng, seed), task, weights
+    encoding = FrameEncoding(config.robot_bridge.encoding)
+    return Evaluation(task, policy_from_weights(task.spec, weights), rng, seed, encoding), task, weights
 
 
 def evaluation_text(episodes: Sequence[EvaluatedEpisode]) -> str:

@@ -16,17 +16,29 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
+import common.frame_encoding
 import common.journal
 import common.messages
 import common.service
 import common.transport
 import services.actor.forwarding
 import services.learner.minibatches
+import services.learner.policy_pushes
 import services.replay.minibatch_senders
 import services.replay.replay
 import services.robot_bridge.answers
 import services.robot_bridge.bridge
-from common.messages import MESSAGES, SCHEMA_VERSION, ActionSource, Array, Bounds, Command, CommandReply
+from common.frame_encoding import EncodedFrames, FrameEncoding
+from common.messages import (
+    MESSAGES,
+    SCHEMA_VERSION,
+    ActionSource,
+    Array,
+    Bounds,
+    CameraFrames,
+    Command,
+    CommandReply,
+)
 from common.topics import SERVICES, TOPICS, Delivery, Lane, Topic, command_topic
 from deploy.docstrings import docstrings, markdown
 from deploy.plan import PORTS, PortMap, connections
@@ -73,6 +85,7 @@ CONSTANTS = (
     (common.service, "OUTAGE_S"),
     (common.service, "DRAIN_TIMEOUT_S"),
     (common.service, "STOP_TIMEOUT_S"),
+    (common.frame_encoding, "MAX_PIXEL_BYTES"),
     (common.journal, "HEAD_PERIOD_S"),
     (common.journal, "RESEND_AFTER_S"),
     (common.journal, "MAX_RANGES"),
@@ -81,17 +94,18 @@ CONSTANTS = (
     (services.replay.minibatch_senders, "LOST_AFTER_S"),
     (services.replay.replay, "ACTOR_LOST_AFTER_S"),
     (services.learner.minibatches, "CREDIT_S"),
+    (services.learner.policy_pushes, "ACKNOWLEDGED_WITHIN_S"),
     (services.robot_bridge.answers, "REMEMBERED_STEPS"),
     (services.robot_bridge.bridge, "REPUBLISH_NS"),
 )
 """Module-level numbers that a peer can notice."""
 
 SETTINGS: tuple[tuple[str, type, tuple[str, ...]], ...] = (
-    ("robot_bridge", RobotBridgeSettings, ("on_missing_action", "stop_after", "peer_grace")),
+    ("robot_bridge", RobotBridgeSettings, ("encoding", "on_missing_action", "stop_after", "peer_grace")),
     ("robot_bridge", RobotBridgeSettings, ("journal_s", "journal_mib", "resend_kib_per_s")),
     ("actor", ActorSettings, ("journal_s", "journal_mib", "resend_kib_per_s", "lockstep_surplus")),
     ("replay", ReplaySettings, ("access", "max_surplus", "message_mib")),
-    ("learner", LearnerSettings, ("access", "prefetch")),
+    ("learner", LearnerSettings, ("access", "prefetch", "push_share")),
 )
 """Settings that a peer can notice: (section, its class, keys)."""
 
@@ -227,7 +241,10 @@ def wire_type(hint: Any) -> str:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         inner, rule = arguments
-        return f"{rule.dtype} ({', '.join(map(str, rule.shape))})" if isinstance(rule, Array) else wire_type(inner)
+        if not isinstance(rule, Array):
+            return wire_type(inner)
+        array = f"{rule.dtype} ({', '.join(map(str, rule.shape))})"
+        return f"{array} or [encoded](#camera-frames)" if isinstance(rule, CameraFrames) else array
     if origin in (Union, types.UnionType):
         return " or ".join("nil" if argument is type(None) else wire_type(argument) for argument in arguments)
     if origin is dict:
@@ -243,11 +260,18 @@ def wire_type(hint: Any) -> str:
 
 def action_source_table() -> str:
     """The values of ActionSource."""
-    documented = docstrings(common.messages)
-    rows = ((f"`{member.value}`", markdown(documented[f"ActionSource.{member.name}"])) for member in ActionSource)
-    return (
-        f"#### ActionSource\n\n{markdown(inspect.getdoc(ActionSource) or '')}\n\n{_table(('value', 'meaning'), rows)}"
-    )
+    return _enumeration_table(ActionSource)
+
+
+def frame_encoding_table() -> str:
+    """The values of FrameEncoding."""
+    return _enumeration_table(FrameEncoding)
+
+
+def _enumeration_table(enumeration: type[StrEnum]) -> str:
+    name, documented = enumeration.__name__, docstrings(sys.modules[enumeration.__module__])
+    rows = ((f"`{member.value}`", markdown(documented[f"{name}.{member.name}"])) for member in enumeration)
+    return f"#### {name}\n\n{markdown(inspect.getdoc(enumeration) or '')}\n\n{_table(('value', 'meaning'), rows)}"
 
 
 def version_line() -> str:
@@ -303,7 +327,8 @@ def _nested(messages: Iterable[type]) -> list[type]:
     for message in messages:
         for hint in get_type_hints(message).values():
             for part in (hint, *get_args(hint)):
-                if is_dataclass(part) and part not in MESSAGES:
+                # Encoded frames are no map, but a list of their own kind.
+                if is_dataclass(part) and part not in MESSAGES and part is not EncodedFrames:
                     found[part] = None
     return list(found)
 
@@ -354,6 +379,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "mesh": mesh_table,
     "messages": message_tables,
     "action sources": action_source_table,
+    "frame encodings": frame_encoding_table,
     "periods": period_table,
     "settings": setting_table,
 }

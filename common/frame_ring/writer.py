@@ -141,7 +141,7 @@ class RingWriter(RingView):
         counters = self._counters
         counters[layout.ROWS_BEGUN] = number + 1
         counters[layout.FRAMES_BEGUN] = first_frame + new
-        for at, frame in enumerate(step.frames[len(step.frames) - new :], start=first_frame):
+        for at, frame in enumerate(step.pixels[len(step.pixels) - new :], start=first_frame):
             self._frames[at % self.layout.capacity_frames] = frame
         self._rows[number % self.layout.capacity_rows] = self._scratch[0]
         counters[layout.FRAMES_DONE] = first_frame + new
@@ -174,10 +174,10 @@ class RingWriter(RingView):
         for name, array, shape in arrays:
             if array.shape != shape:
                 raise MessageError(f"Experience.{name}: expected shape {shape}, got {array.shape}")
-        if sizes.frame_stack and step.frames.shape != (len(step.frame_ids), *sizes.frame_shape):
+        if sizes.frame_stack and step.pixels.shape != (len(step.frame_ids), *sizes.frame_shape):
             raise MessageError(
                 f"Experience.frames: expected {len(step.frame_ids)} frames of {sizes.frame_shape}, "
-                f"got shape {step.frames.shape}"
+                f"got shape {step.pixels.shape}"
             )
 
     def _fill_values(self, experience: Experience) -> None:

@@ -111,7 +111,7 @@ class Actor:
         if self._stack is None or time_step.incarnation < self._newest[0]:
             return None  # A bridge's last words must not displace the frames of its successor.
         try:
-            return self._stack.add(time_step, time_step.frame_ids.tolist(), list(time_step.frames))
+            return self._stack.add(time_step, time_step.frame_ids.tolist(), list(time_step.pixels))
         except MessageError as error:
             self._service.refusals.refuse(topics.TIME_STEP.name, error)
             return None

@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 
 from common import topics
+from common.codec import encode
 from common.errors import MessageError
 from common.inbox import Inbox
-from common.messages import PolicyWeights, TaskSpec
+from common.messages import PolicyAcknowledgement, PolicyWeights, TaskSpec
 from common.policies import policy_from_weights
 from common.policies.base import Policy
 from common.service import Service
@@ -29,6 +30,7 @@ class PolicySwap:
         self._inbox = Inbox(
             service.transport, topics.POLICY, PolicyWeights, self._wake, service.clock, service.refusals
         )
+        self._ack_publisher = service.transport.publisher(topics.POLICY_ACK)
         self._thread = service.clock.thread(self._run, "policy weights")
 
     def start(self) -> None:
@@ -50,7 +52,10 @@ class PolicySwap:
                 if self._stopping:
                     return
             arrived = self._inbox.take_newest()
-            if arrived and arrived.message.version > self.policy.version:
+            if arrived is None:
+                continue
+            self._ack_publisher.put(encode(PolicyAcknowledgement(arrived.message.version)))
+            if arrived.message.version > self.policy.version:
                 self._swap(arrived.message)
 
     def _swap(self, weights: PolicyWeights) -> None:

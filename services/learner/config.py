@@ -35,6 +35,9 @@ class LearnerSettings:
     """Added to the process's niceness, so that updates never delay the bridge."""
     prefetch: int = setting(2, low=1, high=16)
     """Minibatches asked for ahead of need."""
+    push_share: float = setting(1.0, low=0.001, high=1.0)
+    """Share of the network's rate towards the actor that policies may take, by what the last push took; the newest
+    policy is sent. 1: each as soon as the one before has arrived."""
     checkpoint_s: float = setting(30.0, low=1.0)
     """Period of the checkpoint that a restarted learner goes on from, seconds."""
 

@@ -9,66 +9,18 @@ from pathlib import Path
 from common import topics
 from common.algorithms.base import Algorithm
 from common.algorithms.presets import SACConfig
-from common.codec import encode
-from common.errors import TransportError
 from common.messages import PolicyWeights
 from common.minibatch import Minibatch
 from common.service import Service
 from services.learner.checkpoint import CheckpointWriter
 from services.learner.config import LearnerSettings
 from services.learner.minibatches import MinibatchSource
+from services.learner.policy_pushes import PolicyPusher
 
 logger = logging.getLogger(__name__)
 
 METRICS_S = 1.0
 """Period in which losses are read off the algorithm."""
-
-
-class PolicyPusher:
-    """Publishes policies on a thread of its own: a slow link delays the next push, never an update.
-
-    While one is on its way, the next ones replace each other: only the newest is worth sending.
-    """
-
-    def __init__(self, service: Service) -> None:
-        self._publisher = service.transport.publisher(topics.POLICY)
-        self._clock = service.clock
-        self._wake = self._clock.condition()
-        self._pending: PolicyWeights | None = None
-        self._stopping = False
-        self.pushes = 0
-        self.skipped = 0
-        """Policies replaced by a newer one before they were sent."""
-        self._thread = self._clock.thread(self._run, "policy push")
-        self._thread.start()
-
-    def push(self, weights: PolicyWeights) -> None:
-        """Send ``weights`` as soon as the one before is gone."""
-        with self._wake:
-            self.skipped += self._pending is not None
-            self._pending = weights
-            self._wake.notify()
-
-    def close(self) -> None:
-        """Stop; what is pending is not sent. A push that is stuck in a dead link ends with the session."""
-        with self._wake:
-            self._stopping = True
-            self._wake.notify()
-        self._thread.join(0.2)
-
-    def _run(self) -> None:
-        while True:
-            with self._wake:
-                while self._pending is None and not self._stopping:
-                    self._clock.wait(self._wake)
-                if self._stopping or self._pending is None:
-                    return
-                weights, self._pending = self._pending, None
-            try:
-                self._publisher.put(encode(weights))
-            except TransportError:
-                return  # The session was closed around a push that was stuck in a dead link.
-            self.pushes += 1
 
 
 class Learner:
@@ -85,7 +37,7 @@ class Learner:
     ) -> None:
         self._service, self._algorithm, self._config = service, algorithm, config
         self._source = source
-        self._pusher = PolicyPusher(service)
+        self._pusher = PolicyPusher(service, settings.push_share)
         self._checkpoints = CheckpointWriter(Path(service.run.directory))
         self._checkpoint_ns = round(settings.checkpoint_s * 1e9)
         self._policy_version = policy_version
@@ -135,6 +87,7 @@ class Learner:
             "policy_version": self._policy_version,
             "policy_pushes": self._pusher.pushes,
             "pushes_skipped": self._pusher.skipped,
+            "push_bytes_per_s": self._pusher.bytes_per_s,
             "minibatches_dropped": self._source.dropped,
             **self._metrics,
         }

@@ -29,7 +29,7 @@ from services.robot_bridge.answers import Answers
 from services.robot_bridge.bookkeeping import CycleCounts, EpisodeResult, Ledger, Totals
 from services.robot_bridge.config import RobotBridgeSettings
 from services.robot_bridge.tasks.base import Task
-from services.robot_bridge.time_steps import CommandInForce, TimeStepStream
+from services.robot_bridge.time_steps import CommandInForce, TimeStepStream, announced_spec
 from services.robot_bridge.watchdog import Watchdog
 
 logger = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ class RobotBridge:
         surviving_counts: SurvivingCounts | None = None,
     ) -> None:
         self._service, self._task, self._settings = service, task, settings
-        self._clock, self._spec = service.clock, task.spec
+        self._clock, self._spec = service.clock, announced_spec(task.spec, settings.encoding)
         self._realtime = settings.pacing == "realtime"
         self._cycle_ns = round(self._spec.action_cycle_time_s * 1e9)
         self._keeper = CycleKeeper(self._cycle_ns)

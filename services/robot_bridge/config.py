@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from common.config import setting
+from common.frame_encoding import FrameEncoding
 from common.run_settings import JournalSettings, RunSettings, TransportSettings
 
 
@@ -37,6 +38,9 @@ class RobotBridgeSettings(JournalSettings):
     """``realtime``: cycles follow the clock. ``lockstep``: each cycle waits for its action, the world with it."""
     on_missing_action: str = setting("hold", choices=("hold", "zero", "wait"))
     """At the end of a cycle without an action: ``hold`` the last command, command ``zero``, or ``wait`` for it."""
+    encoding: str = setting("raw", choices=tuple(FrameEncoding))
+    """How camera frames travel: ``raw``, ``zstd`` (lossless; for drawn or rendered images) or ``jpeg444`` (a camera's,
+    about a tenth of the bytes; actor and learner see what it leaves)."""
     stop_after: float = setting(0.5, low=0.01, high=60.0)
     """The watchdog stops the robot after this long without a fresh action, seconds."""
     real_time_priority: bool = setting(True)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from common import topics
 from common.codec import encode
-from common.errors import ServiceError
+from common.errors import ConfigError, ServiceError
+from common.frame_encoding import JPEG_CHANNELS, FrameEncoding, encode_frames
 from common.journal import JournalSender
 from common.messages import ActionSource, Float32Array, TaskSpec, TimeStep
 from common.service import Service
@@ -28,11 +29,29 @@ class CommandInForce:
     applied_ns: int
 
 
+def announced_spec(spec: TaskSpec, encoding: str) -> TaskSpec:
+    """Return what the bridge tells its peers of a task whose frames travel in ``encoding``.
+
+    Raises:
+        ConfigError: the task's frames cannot be encoded so.
+    """
+    if not spec.has_camera:
+        return spec
+    channels = spec.dimensions.C
+    if encoding == FrameEncoding.JPEG444 and channels != JPEG_CHANNELS:
+        raise ConfigError(
+            f"robot_bridge.encoding = {encoding}: expected a task with frames of {JPEG_CHANNELS} channels, "
+            f"{spec.task} has {channels}; choose zstd or raw"
+        )
+    return replace(spec, frame_encoding=FrameEncoding(encoding))
+
+
 class TimeStepStream:
     """Builds, numbers and publishes the TimeSteps of this incarnation."""
 
     def __init__(self, service: Service, spec: TaskSpec, settings: RobotBridgeSettings, counts: CycleCounts) -> None:
-        self._service, self._counts, self._dimensions = service, counts, spec.dimensions
+        self._service, self._counts = service, counts
+        self._dimensions, self._encoding = spec.dimensions, spec.frame_encoding
         self._payload = b""
         self.journal = JournalSender(
             service.transport,
@@ -64,6 +83,8 @@ class TimeStepStream:
         if not (np.isfinite(reading.proprioception).all() and np.isfinite(reward)):
             raise ServiceError(f"a sensor gave {reading.proprioception}, reward {reward}: expected finite numbers")
         self._check_shapes(reading)
+        # Here, in the cycle: the observation waits for it either way, and a thread of its own would add a hand-over.
+        frames = encode_frames(reading.frames, self._encoding)
         first = ledger.step_index == 0
         by_actor = command.source in (ActionSource.POLICY, ActionSource.HELD) and not first
         time_step = TimeStep(
@@ -75,7 +96,7 @@ class TimeStepStream:
             published_ns=self._service.clock.now_ns(),
             frame_ids=reading.frame_ids,
             frame_capture_ns=reading.frame_capture_ns,
-            frames=reading.frames,
+            frames=frames,
             proprioception=reading.proprioception,
             action=command.action,
             action_source=ActionSource.NONE if first else command.source,

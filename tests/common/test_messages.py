@@ -7,22 +7,23 @@ import numpy as np
 import pytest
 
 from common import messages
+from common.frame_encoding import FrameEncoding
 from common.messages import MESSAGES, Array, Count, Dimensions
 from tests.helpers import make_experience, make_spec, make_time_step
 
 _NESTED = {"PolicyExtras"}
 """Travels only inside another message."""
-_NO_MESSAGES = {"Array", "Bounds", "Dimensions"}
+_NO_MESSAGES = {"Array", "Bounds", "CameraFrames", "Dimensions"}
 
 
 def test_dimensions_are_read_off_the_task_specification():
-    assert make_spec().dimensions == Dimensions(A=2, P=5, H=6, W=8, C=3, S=4)
+    assert make_spec().dimensions == Dimensions(A=2, P=5, H=6, W=8, C=3, S=4, frame_encoding=FrameEncoding.RAW)
 
 
 def test_a_task_without_camera_has_frames_of_no_size():
     spec = make_spec(camera=False)
     assert not spec.has_camera
-    assert spec.dimensions == Dimensions(A=2, P=5, H=0, W=0, C=0, S=0)
+    assert spec.dimensions == Dimensions(A=2, P=5, H=0, W=0, C=0, S=0, frame_encoding=FrameEncoding.RAW)
 
 
 def test_a_task_with_frames_in_its_observation_has_a_camera():
@@ -73,7 +74,7 @@ def test_shapes_use_the_letters_of_the_table():
         for letter in rule.shape
         if isinstance(letter, str)
     }
-    sizes = {item.name for item in fields(Dimensions)}
+    sizes = {item.name for item in fields(Dimensions)} - {"frame_encoding"}
     assert letters >= sizes
     assert letters - sizes == {"k", "n", "m", "B"}  # sizes that are a message's own
 

@@ -7,6 +7,7 @@ import pytest
 import tomli_w
 
 from common.codec import encode
+from common.frame_encoding import FrameEncoding, encode_frames, pixels_of
 from common.messages import TaskSpec
 from common.policies import ChosenAction, Observation, pack_weights
 from common.policies.weights import initial_parameters
@@ -36,9 +37,27 @@ class Steering:
         return ChosenAction((-self._gain * (position + 2 * velocity)).astype(np.float32), 0.0)
 
 
-def evaluation(policy: Steering, name: str = "dot_reacher", seed: int = 0, **overrides: float) -> Evaluation:
+def evaluation(
+    policy: Steering,
+    name: str = "dot_reacher",
+    seed: int = 0,
+    encoding: FrameEncoding = FrameEncoding.RAW,
+    **overrides: float,
+) -> Evaluation:
     rng = np.random.default_rng(0)
-    return Evaluation(load_task(name, overrides=overrides, rng=rng), policy, rng, seed)
+    return Evaluation(load_task(name, overrides=overrides, rng=rng), policy, rng, seed, encoding)
+
+
+def test_the_policy_sees_what_the_runs_encoding_leaves_of_the_frames() -> None:
+    seen = {}
+    for encoding in FrameEncoding:
+        policy = Steering(gain=0.0)
+        evaluation(policy, "visual_dot_reacher", encoding=encoding, time_limit=3).run_episode(0)
+        seen[encoding] = np.concatenate(policy.frames)
+    raw, jpeg = seen[FrameEncoding.RAW], seen[FrameEncoding.JPEG444]
+    np.testing.assert_array_equal(seen[FrameEncoding.ZSTD], raw)
+    np.testing.assert_array_equal(jpeg[-1], pixels_of(encode_frames(raw[-1:], FrameEncoding.JPEG444))[0])
+    assert (jpeg != raw).any()
 
 
 def test_a_policy_that_reaches_the_goal_pays_a_step_at_a_time() -> None:

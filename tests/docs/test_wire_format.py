@@ -17,6 +17,7 @@ import zenoh
 
 from common import messages, topics
 from common.codec import decode, encode
+from common.frame_encoding import EncodedFrames, FrameEncoding, encode_frames
 from common.frame_stack import FrameStack
 from common.messages import (
     MESSAGES,
@@ -31,6 +32,7 @@ from common.messages import (
     Experience,
     Finished,
     Float32Array,
+    PolicyAcknowledgement,
     PolicyExtras,
     PolicyWeights,
     RowMinibatch,
@@ -97,6 +99,8 @@ def make_array_minibatch() -> ArrayMinibatch:
 EXAMPLES = (
     SPEC,
     make_time_step(3),
+    make_time_step(3, frames=encode_frames(make_time_step(3).frames, FrameEncoding.ZSTD)),
+    make_time_step(3, frames=encode_frames(make_time_step(3).frames, FrameEncoding.JPEG444)),
     Action(5, 6, 7, np.array([0.5, -1], np.float32), -1.25, 3, 8, 9),
     make_experience(0),
     make_experience(3),
@@ -106,6 +110,7 @@ EXAMPLES = (
     RowMinibatch(4, 11, np.array([5, 9, 5])),
     make_array_minibatch(),
     make_weights(SPEC),
+    PolicyAcknowledgement(4),
     Status("actor", "run", "robot0", 5, "running", {"actions": 3.0}, {"robot_bridge": 2**61}),
     Finished(5, 100, "steps"),
     Command("stop"),
@@ -119,7 +124,10 @@ def as_fields(message: Any) -> dict[str, Any]:
     """A message as a client has it: a dictionary, nested messages too."""
     values = {field.name: getattr(message, field.name) for field in fields(message)}
     for name, value in values.items():
-        values[name] = as_fields(value) if dataclasses.is_dataclass(value) else value
+        if isinstance(value, EncodedFrames):
+            values[name] = value.pixels
+        elif dataclasses.is_dataclass(value):
+            values[name] = as_fields(value)
     return values
 
 
@@ -171,7 +179,8 @@ def test_rows_written_by_hand():
     rows = {f"{name}.{field}": row for name, table in Tables(text()).messages.items() for field, row in table.items()}
     expected = {
         "TimeStep.seq": ("int", "ordinal", "≥ 0, ≤ 2^62"),
-        "TimeStep.frames": ("uint8 (k, H, W, C)", "0 to 255", ""),
+        "TimeStep.frames": ("uint8 (k, H, W, C) or encoded", "0 to 255", ""),
+        "TaskSpec.frame_encoding": ("str FrameEncoding", "", ""),
         "TimeStep.frame_capture_ns": ("int64 (k)", "ns", ""),
         "TimeStep.proprioception": ("float32 (P)", "the task's own", "finite"),
         "TimeStep.action_source": ("str ActionSource", "", ""),
@@ -379,12 +388,12 @@ def test_a_service_reads_what_the_client_writes(message):
 
 def test_the_client_refuses_another_message_schema_and_dtype():
     client = program("client.py")
-    with pytest.raises(ValueError, match="expected Action of schema 1, got Command of schema 1"):
+    with pytest.raises(ValueError, match="expected Action of schema 2, got Command of schema 2"):
         client.decode(encode(Command("stop")), "Action")
-    with pytest.raises(ValueError, match="got Command of schema 2"):
-        client.decode(msgpack.packb({"schema": 2, "message": "Command", "name": "stop"}))
+    with pytest.raises(ValueError, match="got Command of schema 3"):
+        client.decode(msgpack.packb({"schema": 3, "message": "Command", "name": "stop"}))
     with pytest.raises(ValueError, match="expected a dtype"):
-        client.decode(msgpack.packb({"schema": 1, "message": "X", "x": ["|O", [1], b"12345678"]}))
+        client.decode(msgpack.packb({"schema": 2, "message": "X", "x": ["|O", [1], b"12345678"]}))
 
 
 def test_the_tables_refuse_what_is_not_as_they_say():

@@ -1,7 +1,7 @@
 """Reads a live run knowing nothing but ``docs/wire-format.md``, and holds it to every word there.
 
 Run outside the repository, beside the document and the files that stand in it (``client.py``, ``observation.py``,
-``policy.py``), with nothing importable but zenoh, msgpack and NumPy::
+``policy.py``), with nothing importable but zenoh, msgpack, NumPy, xxhash and zstd::
 
     python wire_listener.py DOCUMENT RUN ROBOT ENDPOINT ...
 
@@ -35,6 +35,7 @@ ENOUGH = {
     "credit": 3,
     "minibatch/arrays": 20,
     "policy": 5,
+    "policy/ack": 3,
     "status": 20,
 }
 """Messages to hear on each topic."""
@@ -66,7 +67,11 @@ class Tables:
 
     def __init__(self, document):
         self.topics = {plain(row["topic"]): row for row in table_rows(document, "<!-- table: topics -->")}
-        self.values = [plain(row["value"]) for row in table_rows(document, "#### ActionSource")]
+        enumerations = ("ActionSource", "FrameEncoding")
+        self.values = {
+            f"str {name}": [plain(row["value"]) for row in table_rows(document, f"#### {name}\n")]
+            for name in enumerations
+        }
         start, end = document.index("<!-- table: messages -->"), document.index("<!-- table: action sources -->")
         names = re.findall(r"^#### (\w+)$", document[start:end], re.MULTILINE)
         self.messages = {
@@ -82,6 +87,8 @@ class Tables:
             self._check(f"{message}.{name}", kind, bounds, value, sizes)
 
     def _check(self, where, kind, bounds, value, sizes):
+        # What the client reads is pixels, encoded or not.
+        kind = kind.removesuffix(" or encoded")
         if match := re.fullmatch(r"(\w+) \((.*)\)", kind):
             self._check_array(where, match[1], match[2].split(", "), bounds, value, sizes)
         elif kind.endswith(" or nil"):
@@ -97,8 +104,8 @@ class Tables:
                 self._check(where, match[1], bounds, item, sizes)
         elif match := re.fullmatch(r"map (\w+)", kind):
             self.check(match[1], value, sizes)
-        elif kind == "str ActionSource":
-            assert value in self.values, f"{where}: {value}"
+        elif kind in self.values:
+            assert value in self.values[kind], f"{where}: {value}"
         else:
             wanted = {"int": int, "float": float, "bool": bool, "str": str}[kind]
             assert type(value) is wanted, f"{where}: expected {kind}, got {value!r}"

@@ -8,6 +8,7 @@ import pytest
 
 from common import topics
 from common.clock import FakeClock
+from common.frame_encoding import FrameEncoding, encode_frames
 from common.messages import Finished
 from tests.helpers import eventually, make_spec
 from tests.services.actor.scene import ACTOR, BRIDGE, Scene, TellingPolicy
@@ -168,6 +169,31 @@ def test_frames_whose_ids_do_not_increase_are_refused_and_not_acted_on(tmp_path)
     bad = scene.time_step(1, frame_ids=ids, frame_capture_ns=ids, frames=np.zeros((2, 6, 8, 3), np.uint8))
     assert scene.take(bad) == []
     assert scene.service.refusals.counts == {"timestep": 1}
+
+
+@pytest.mark.parametrize("encoding", [FrameEncoding.ZSTD, FrameEncoding.JPEG444])
+def test_encoded_frames_are_acted_on_as_decoded_and_forwarded_as_they_came(tmp_path, encoding):
+    scene = Scene(tmp_path, make_spec(frame_encoding=encoding))
+    noise = np.random.default_rng(0).integers(0, 256, (1, 6, 8, 3), np.uint8)
+    sent = scene.time_step(0, frames=encode_frames(noise, encoding))
+    scene.actor._forwarder.start()
+    try:
+        scene.take(sent)
+        (experience,) = scene.experiences.wait_for(1)
+    finally:
+        scene.actor._forwarder.stop()
+    (observation,) = scene.policy.observations
+    np.testing.assert_array_equal(observation.frames, np.repeat(sent.frames.pixels, 4, axis=0))
+    assert experience.time_step.frames.parts == sent.frames.parts
+
+
+def test_damaged_frames_are_dropped_and_counted(tmp_path):
+    scene = Scene(tmp_path, make_spec(frame_encoding=FrameEncoding.JPEG444))
+    good = encode_frames(scene.time_step(0).frames, FrameEncoding.JPEG444)
+    damaged = replace(good, parts=(good.parts[0][:-3] + b"\0\xff\xd9",))
+    assert scene.take(scene.time_step(0, frames=damaged), scene.time_step(0)) == []
+    assert scene.service.refusals.counts == {"timestep": 2}
+    assert seqs(scene.take(scene.time_step(0, frames=good))) == [0]
 
 
 @pytest.mark.parametrize(

@@ -54,6 +54,14 @@ def test_a_newer_policy_is_swapped_in_and_acts_as_the_learner_made_it(learner):
     np.testing.assert_array_equal(got.action, expected.action)
 
 
+@pytest.mark.parametrize("version", [1, 3])
+def test_the_learner_is_told_what_has_arrived_be_it_of_use_or_not(learner, version):
+    learner.start_swap()
+    acknowledgements = learner.messages(topics.POLICY_ACK)
+    learner.push(make_weights(SPEC, version))
+    assert [ack.version for ack in acknowledgements.wait_for(1)] == [version]
+
+
 @pytest.mark.parametrize("version", [1, 2])
 def test_a_policy_that_is_not_newer_is_ignored(learner, version):
     swap = learner.start_swap()

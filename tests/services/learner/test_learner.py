@@ -1,6 +1,5 @@
 """The learner updates from what comes, pushes the newest policy, and goes on after a restart."""
 
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +15,8 @@ from common.policies import policy_from_weights
 from common.transport import InMemoryNetwork
 from services.learner.checkpoint import CHECKPOINT_FILE, POLICY_FILE, restore
 from services.learner.config import LearnerSettings
-from services.learner.learner import Learner, PolicyPusher
-from tests.helpers import TIMEOUT_S, eventually, make_spec
+from services.learner.learner import Learner
+from tests.helpers import eventually, make_spec
 from tests.reference.tasks import make_minibatch
 from tests.services.builders import Peer, SoloService
 
@@ -155,60 +154,6 @@ def test_losses_are_told_once_a_second(tmp_path):
     counters = scene.learner.counters()
     assert np.isfinite(counters["critic_loss"])
     assert counters["updates_per_s"] == pytest.approx(1 / 1.2)  # since it was told before
-
-
-# ---------------------------------------------------------------------- pushing
-
-
-class SlowLink:
-    """A link on which each policy takes until the test lets it through."""
-
-    def __init__(self, directory) -> None:
-        self.network = InMemoryNetwork()
-        self.service = SoloService(topics.LEARNER, self.network, directory)
-        self.arrived, self._free, self.entered = [], threading.Semaphore(0), threading.Semaphore(0)
-        Peer(self.network).transport.subscribe(topics.POLICY, self._carry)
-        self.pusher = PolicyPusher(self.service)
-        self._algorithm = make_algorithm()
-
-    def push(self, version) -> None:
-        self.pusher.push(self._algorithm.policy_weights(version, "float32"))
-
-    def wait_for_one_on_its_way(self) -> None:
-        assert self.entered.acquire(timeout=TIMEOUT_S)
-
-    def let_through(self, count) -> None:
-        for _ in range(count):
-            self._free.release()
-
-    def _carry(self, payload) -> None:
-        self.entered.release()
-        assert self._free.acquire(timeout=TIMEOUT_S)
-        self.arrived.append(decode(payload, PolicyWeights).version)
-
-
-def test_while_one_policy_is_on_its_way_the_next_ones_replace_each_other(tmp_path):
-    link = SlowLink(tmp_path)
-    link.push(1)
-    link.wait_for_one_on_its_way()
-    for version in (2, 3, 4):
-        link.push(version)  # returns at once
-    assert link.pusher.skipped == 2
-    link.let_through(2)
-    eventually(lambda: link.pusher.pushes == 2)
-    assert link.arrived == [1, 4]
-    link.pusher.close()
-
-
-def test_a_push_that_is_stuck_does_not_hold_up_the_end(tmp_path):
-    link = SlowLink(tmp_path)
-    link.push(1)
-    link.wait_for_one_on_its_way()
-    link.push(2)
-    link.pusher.close()
-    assert link.arrived == []
-    link.let_through(2)
-    eventually(lambda: link.arrived == [1])  # what was pending is not sent after the end
 
 
 # ---------------------------------------------------------------------- checkpoints

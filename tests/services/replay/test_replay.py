@@ -10,6 +10,7 @@ from common import topics
 from common.algorithms.presets import SACConfig
 from common.clock import FakeClock
 from common.errors import RingError
+from common.frame_encoding import FrameEncoding, encode_frames
 from common.frame_ring import RING_FILE, RingReader, minibatch_from_arrays
 from common.messages import Credit, Experience, Finished, RowMinibatch, StreamHead
 from common.transport import InMemoryNetwork
@@ -28,11 +29,11 @@ CONFIG = SACConfig(batch_size=4, min_size_to_sample=10, replay_capacity=200)
 class Scene:
     """Replay, not running, between an actor and a learner that the test plays."""
 
-    def __init__(self, directory, config=CONFIG, pacing="realtime", **settings) -> None:
+    def __init__(self, directory, config=CONFIG, pacing="realtime", encoding=FrameEncoding.RAW, **settings) -> None:
         self.clock = FakeClock()
         self.network = InMemoryNetwork()
         self.service = SoloService(topics.REPLAY, self.network, directory, self.clock)
-        spec = replace(task_spec(), pacing=pacing)
+        spec = replace(task_spec(), pacing=pacing, frame_encoding=encoding)
         self.replay = Replay(self.service, spec, config, ReplaySettings(**settings))
         self.peer = Peer(self.network)
         self.acks = self.peer.messages(topics.EXPERIENCE_ACK)
@@ -185,6 +186,25 @@ def test_experience_that_cannot_be_kept_is_refused_and_the_rest_goes_on(scene):
     assert scene.counter("rows") == 2
     assert scene.ack().next_seq == 3  # resending would not make it better
     assert scene.replay.details()["produced_seen"] == {"1": 3}  # so it shows as lost
+
+
+@pytest.mark.parametrize("encoding", [FrameEncoding.ZSTD, FrameEncoding.JPEG444])
+def test_encoded_frames_are_kept_as_the_actor_has_seen_them(tmp_path, encoding):
+    scene = Scene(tmp_path, encoding=encoding)
+    experiences = []
+    for experience in attempt(Bridge(), 3):
+        step = experience.time_step
+        noise = np.random.default_rng(step.seq).integers(0, 256, step.frames.shape, np.uint8)
+        encoded = replace(step, frames=encode_frames(noise, encoding))
+        experiences.append(replace(experience, time_step=encoded))
+    damaged = replace(experiences[1].time_step.frames, digest="0" * 16)
+    scene.send(replace(experiences[1], time_step=replace(experiences[1].time_step, frames=damaged)))
+    assert scene.service.refusals.counts == {"experience": 1}
+    scene.send(*experiences)
+    assert scene.counter("rows") == 3
+    seen = np.concatenate([experience.time_step.pixels for experience in experiences])
+    np.testing.assert_array_equal(RingReader(tmp_path / RING_FILE).frames[: len(seen)], seen)
+    scene.replay._ring.close()
 
 
 @pytest.mark.parametrize("topic", [topics.EXPERIENCE, topics.EXPERIENCE_RESENT, topics.EXPERIENCE_HEAD, topics.CREDIT])

@@ -27,9 +27,19 @@ class ScriptedTask(Task):
     """A cart in the plane: its command is its velocity. It is at the goal after the cycles it is told."""
 
     def __init__(
-        self, clock, goal_cycles=(), *, time_limit=1000, reset_steps=0, has_goal=True, pacing="realtime", camera=False
+        self,
+        clock,
+        goal_cycles=(),
+        *,
+        time_limit=1000,
+        reset_steps=0,
+        has_goal=True,
+        pacing="realtime",
+        camera=False,
+        channels=3,
     ) -> None:
         self._clock, self._goal_cycles, self._camera = clock, set(goal_cycles), camera
+        self._shape = (2, 3, channels) if camera else (0, 0, 0)
         self._position, self._velocity = np.zeros(2), np.zeros(2, np.float32)
         self._cycles = self._frames = 0
         self._now_ns = None
@@ -48,7 +58,7 @@ class ScriptedTask(Task):
             action_high=np.array([1, 2], np.float32),
             proprioception_low=np.full(2, -1, np.float32),
             proprioception_high=np.full(2, 1, np.float32),
-            frame_shape=np.array([2, 3, 3] if camera else [0, 0, 0]),
+            frame_shape=np.array(self._shape),
             frame_stack=2 if camera else 0,
             crop_margin=np.zeros(2, np.int64),
             action_cycle_time_s=CYCLE_S,
@@ -88,9 +98,8 @@ class ScriptedTask(Task):
         new = 2 if self._camera else 0
         ids = np.arange(self._frames, self._frames + new)
         self._frames += new
-        shape = (2, 3, 3) if self._camera else (0, 0, 0)
         return SensorReading(
-            frames=np.array([np.full(shape, i, np.uint8) for i in ids], np.uint8).reshape(new, *shape),
+            frames=np.array([np.full(self._shape, i, np.uint8) for i in ids], np.uint8).reshape(new, *self._shape),
             frame_ids=ids,
             frame_capture_ns=np.full(new, self._now_ns or 0),
             proprioception=(self._position + self.offset).astype(np.float32),
@@ -133,6 +142,7 @@ class Scene:
         self.settings = RobotBridgeSettings(**{"pacing": self.task.spec.pacing, **settings})
         self.bridge = RobotBridge(self.service, self.task, self.settings, totals or Totals())
         self.actor = Peer(self.network)
+        self.announced = decode(self.actor.transport.query(topics.SPEC), TaskSpec)
         self.answers = answers if callable(answers) else lambda time_step: answers
         self.probe_answer = 0.0
         self.time_steps: list[TimeStep] = []
@@ -162,7 +172,7 @@ class Scene:
         return self.bridge.counts
 
     def _receive(self, payload) -> None:
-        time_step = decode(payload, TimeStep, self.task.spec.dimensions)
+        time_step = decode(payload, TimeStep, self.announced.dimensions)
         self.time_steps.append(time_step)
         self.published_s.append((time_step.published_ns - START_NS) / 1e9)
         if time_step.is_last:

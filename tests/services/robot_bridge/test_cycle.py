@@ -5,6 +5,7 @@ import pytest
 
 from common import topics
 from common.codec import decode
+from common.errors import ConfigError
 from common.messages import ActionSource, TaskSpec
 from tests.services.builders import START_NS
 from tests.services.robot_bridge.scripted import ACTOR, BRIDGE, PROBE, Scene, action_of
@@ -288,6 +289,29 @@ def test_camera_frames_travel_as_the_camera_numbered_them(tmp_path):
     assert [t.frame_ids.tolist() for t in time_steps] == [[0, 1], [2, 3], [4, 5], [6, 7]]
     assert [t.frames[:, 0, 0, 0].tolist() for t in time_steps] == [[0, 1], [2, 3], [4, 5], [6, 7]]
     assert time_steps[3].frame_capture_ns.tolist() == [ns(0.08)] * 2
+
+
+@pytest.mark.parametrize("encoding", ["zstd", "jpeg444"])
+def test_camera_frames_travel_encoded_as_announced(tmp_path, encoding):
+    scene = Scene(tmp_path, task={"camera": True}, steps=2, encoding=encoding)
+    time_steps = scene.run()
+    assert scene.announced.frame_encoding == encoding
+    assert {t.frames.encoding for t in time_steps} == {encoding}
+    # Grey, all over: JPEG keeps that too, within what its quantisation leaves of the level.
+    levels = np.array([t.pixels[:, 0, 0, 0] for t in time_steps], int)
+    assert np.abs(levels - [[0, 1], [2, 3], [4, 5], [6, 7]]).max() <= (0 if encoding == "zstd" else 1)
+
+
+def test_without_a_camera_there_is_nothing_to_encode(tmp_path):
+    scene = Scene(tmp_path, steps=2, encoding="jpeg444")
+    scene.run()
+    assert scene.announced.frame_encoding == "raw"
+
+
+def test_an_encoding_that_the_tasks_frames_do_not_fit_is_refused_at_the_start(tmp_path):
+    Scene(tmp_path, task={"camera": True, "channels": 1}, encoding="zstd")
+    with pytest.raises(ConfigError, match=r"robot_bridge.encoding = jpeg444: expected .* 3 channels, scripted has 1"):
+        Scene(tmp_path, task={"camera": True, "channels": 1}, encoding="jpeg444")
 
 
 def test_the_bridge_answers_what_the_task_looks_like(tmp_path):
