@@ -14,7 +14,7 @@ from typing import Any
 from common.algorithms import ALGORITHMS
 from common.config import read_toml
 from common.errors import ConfigError
-from deploy.network import PRESETS, NetworkConditions, load_network, parse_network
+from deploy.network import LINK_PREFERENCES, PRESETS, LinkPreference, NetworkConditions, load_network, parse_network
 from deploy.network.conditions import DIRECTIONS
 from deploy.placement import Placement, load_placement, mode_names
 from deploy.plan import RunRequest, split_overrides
@@ -47,6 +47,8 @@ class LaunchOptions:
     base_port: int | None
     write_config: Path | None
     """Only write the configurations to this folder."""
+    network_backend: LinkPreference = "auto"
+    """How the network is emulated."""
 
 
 def parse_options(arguments: Sequence[str] | None = None) -> LaunchOptions:
@@ -75,7 +77,7 @@ def parse_options(arguments: Sequence[str] | None = None) -> LaunchOptions:
         overrides=tuple(for_services),
     )
     write_config = options.write_config.absolute() if options.write_config else None
-    return LaunchOptions(request, network, conditions, options.base_port, write_config)
+    return LaunchOptions(request, network, conditions, options.base_port, write_config, options.network_backend)
 
 
 def choose_network(
@@ -89,7 +91,9 @@ def choose_network(
     conditions = load_network(name_or_path or "ideal")
     name = name_or_path if name_or_path in PRESETS else Path(name_or_path or "ideal").stem
     if overrides:
-        conditions = parse_network(_overridden(name_or_path or "ideal", overrides))
+        # A trace's path starts from the file, like in the file; without one, from where the user is.
+        directory = Path() if name_or_path is None or name_or_path in PRESETS else Path(name_or_path).parent
+        conditions = parse_network(_overridden(name_or_path or "ideal", overrides), directory=directory)
         name = f"{name}, changed"
     if placement.spans_hosts:
         return name, conditions
@@ -146,6 +150,12 @@ def _parser() -> argparse.ArgumentParser:
         "--network",
         metavar="PRESET|FILE",
         help=f"network between the hosts: {', '.join(PRESETS)}, or a TOML file with a table [network]",
+    )
+    parser.add_argument(
+        "--network-backend",
+        choices=LINK_PREFERENCES,
+        default="auto",
+        help="how the network is emulated (default: %(default)s, namespaces where they can be made, else the relay)",
     )
     parser.add_argument("--run-dir", type=Path, metavar="DIR", help="folder of the run's record (default: in runs/)")
     parser.add_argument(

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from common.errors import ConfigError
-from deploy.network.conditions import NetworkConditions, parse_network
+from deploy.network.conditions import NetworkConditions
+from deploy.network.table import parse_network
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_TIMERSLACK = 29
@@ -36,7 +37,7 @@ class LinkProcessSettings:
 
 def add_link_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of every link process."""
-    parser.add_argument("--conditions", required=True, help="the [network] table, as JSON")
+    parser.epilog = "The [network] table is read from standard input, as JSON."
     parser.add_argument("--part", type=Path, required=True, help="file to write the link's part of the record to")
     parser.add_argument("--seed", type=int, default=0, help="seed of jitter and loss")
     parser.add_argument("--parent-pid", type=int, default=os.getppid(), help="process to end with")
@@ -45,9 +46,9 @@ def add_link_arguments(parser: argparse.ArgumentParser) -> None:
 def read_settings(parser: argparse.ArgumentParser, parsed: argparse.Namespace) -> LinkProcessSettings:
     """The options of :func:`add_link_arguments`, checked."""
     try:
-        conditions = parse_network(json.loads(parsed.conditions))
+        conditions = parse_network(json.load(sys.stdin))
     except (json.JSONDecodeError, ConfigError) as error:
-        parser.error(f"--conditions: {error}")
+        parser.error(f"standard input: {error}")
     return LinkProcessSettings(conditions, parsed.part, parsed.seed, parsed.parent_pid)
 
 
