@@ -56,7 +56,7 @@ class LinkProcess:
                 stdin=table,
                 stdout=subprocess.PIPE,
                 stderr=log,
-                env={**os.environ, "PYTHONPATH": _python_path()},
+                env={**os.environ, "PYTHONPATH": python_path()},
                 start_new_session=True,
             )
         ready = self._wait_until_ready(self._process)
@@ -129,6 +129,7 @@ def trace_over(conditions: NetworkConditions, start_monotonic_ns: int) -> str | 
     return f"the trace {trace.name} is over after {end_s:g} s, and trace_end = 'stop'; 'loop' begins it again"
 
 
-def _python_path() -> str:
+def python_path() -> str:
+    """``PYTHONPATH`` of a process that runs this project's modules, wherever it is started."""
     inherited = os.environ.get("PYTHONPATH")
     return f"{_REPOSITORY}{os.pathsep}{inherited}" if inherited else str(_REPOSITORY)

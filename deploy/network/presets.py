@@ -33,7 +33,7 @@ def _both(direction: DirectionConditions, outage_every_s: float = 0.0, outage_s:
 PRESETS: dict[str, NetworkConditions] = {
     "ideal": _both(DirectionConditions()),
     "lan": _both(DirectionConditions(delay_ms=0.2, rate_mbit=100.0)),
-    "wifi_good": _both(DirectionConditions(delay_ms=1.5, jitter_ms=0.5, loss=0.001, rate_mbit=80.0)),
+    "wifi_good": _both(DirectionConditions(delay_ms=1.5, jitter_ms=0.5, loss=0.002, rate_mbit=80.0)),
     "wifi_office": _both(DirectionConditions(delay_ms=3.0, jitter_ms=2.0, loss=0.005, rate_mbit=40.0)),
     "wifi_bad": _both(DirectionConditions(delay_ms=20.0, jitter_ms=15.0, loss=0.02, rate_mbit=12.0)),
     "outage": _both(DirectionConditions(delay_ms=3.0, rate_mbit=20.0), outage_every_s=20.0, outage_s=1.0),

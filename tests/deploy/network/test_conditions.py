@@ -16,7 +16,7 @@ from deploy.network import PRESETS, DirectionConditions, NetworkConditions, Trac
     [
         ("ideal", DirectionConditions()),
         ("lan", DirectionConditions(delay_ms=0.2, rate_mbit=100)),
-        ("wifi_good", DirectionConditions(delay_ms=1.5, jitter_ms=0.5, loss=0.001, rate_mbit=80)),
+        ("wifi_good", DirectionConditions(delay_ms=1.5, jitter_ms=0.5, loss=0.002, rate_mbit=80)),
         ("wifi_office", DirectionConditions(delay_ms=3, jitter_ms=2, loss=0.005, rate_mbit=40)),
         ("wifi_bad", DirectionConditions(delay_ms=20, jitter_ms=15, loss=0.02, rate_mbit=12)),
         ("outage", DirectionConditions(delay_ms=3, rate_mbit=20)),
