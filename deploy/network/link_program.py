@@ -17,9 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from common.errors import ConfigError
+from common.priority import run_before_others
 from deploy.network.conditions import NetworkConditions
 from deploy.network.table import parse_network
 
+LINK_PRIORITY = 1
+"""Of SCHED_RR: a packet is not late because someone learns. The bridge still comes first."""
 _PR_SET_PDEATHSIG = 1
 _PR_SET_TIMERSLACK = 29
 
@@ -60,8 +63,7 @@ def prepare_link_process(parent_pid: int) -> None:
         sys.exit("the process that started this link has ended")
     # Timers may fire up to 50 us late by default, and a link without any delay is measured in tens of them.
     libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, -15)
+    run_before_others(LINK_PRIORITY)
     # Packets and their bookkeeping form no cycles; a collection would only be a pause.
     gc.disable()
 
