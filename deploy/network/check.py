@@ -88,7 +88,7 @@ def run_check(parsed: argparse.Namespace, say: Callable[[str], None] = print) ->
     Raises:
         ConfigError: a network that cannot be used.
     """
-    networks = {name: load_network(name) for name in parsed.network or PRESETS}
+    networks = {Path(name).stem: load_network(name) for name in parsed.network or PRESETS}
     misses: list[str] = []
     measured: set[Backend] = set()
     for backend in parsed.backend or BACKENDS:
@@ -104,6 +104,10 @@ def run_check(parsed: argparse.Namespace, say: Callable[[str], None] = print) ->
                 rows = measure(check, parsed.seed)
             except LinkUnavailable as error:
                 say(f"{check.network:<12} not measured: {error}")
+                continue
+            except LinkFailedError as error:
+                say(f"{check.network:<12} FAILED: {error}")
+                misses.append(f"{backend} {check.network}")
                 continue
             finally:
                 _progress("")
@@ -134,7 +138,7 @@ def row_text(network: str, row: Row) -> str:
     measured = "nothing" if row.measured is None else f"{row.measured:.3f}"
     return (
         f"{network:<12} {row.direction:<9} {row.quantity:<10} {row.expected:>10.3f} {measured:>10} "
-        f"{f'± {row.allowed:.3f}':>10} {row.unit:<6} {'ok' if row.ok else 'MISSES'}"
+        f"{f'± {row.allowed:.3f}':>10} {row.unit:<6} {'ok' if row.ok else f'MISSES {row.note}'.rstrip()}"
     )
 
 
@@ -174,6 +178,7 @@ def measure(check: Check, seed: int = 0) -> list[Row]:
                     sent=read_sent(directory / f"{direction}.sent"),
                     received=read_received(directory / f"{direction}.received"),
                     counts=part.directions[direction],
+                    lost_take_their_turn=check.backend != "netem",
                 )
             )
         ]

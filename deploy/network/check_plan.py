@@ -147,7 +147,9 @@ def _loss_packets(one_way: DirectionConditions) -> Phase:
             packets_per_s = min(packets_per_s, 0.5 * packet_limit(one_way) / flight_s)
     group = min(8, max(1, one_way.queue_packets // 2)) if one_way.queue_packets else 8
     blocks = min(_loss_blocks_needed(one_way), math.ceil(_MAX_LOSS_PHASE_S * packets_per_s))
-    return Phase(LOSS, blocks, SMALL_BYTES, group / packets_per_s, group)
+    # A computer that is too slow for so many sends fewer, and the tolerance grows.
+    limit_s = 1.0 + 2.0 * blocks / packets_per_s
+    return Phase(LOSS, blocks, SMALL_BYTES, group / packets_per_s, group, limit_s=limit_s)
 
 
 def _rate_packets(one_way: DirectionConditions) -> list[Phase]:

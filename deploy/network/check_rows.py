@@ -49,6 +49,8 @@ class Row:
     """None: nothing came."""
     allowed: float
     """How far off it may be."""
+    note: str = ""
+    """What a miss may come from, apart from the link."""
 
     @property
     def ok(self) -> bool:
@@ -68,6 +70,8 @@ class Crossed:
     received: Received
     counts: DirectionCounts
     """The link's own."""
+    lost_take_their_turn: bool = True
+    """Whether what is lost has taken its time at the rate; netem loses it before."""
 
 
 def compare(crossed: Crossed) -> list[Row]:
@@ -139,13 +143,13 @@ def _loss_row(
 
 
 def _rate(crossed: Crossed) -> Row:
-    """Of what was sent, by how much of it arrived: a packet that the air lost has taken its time, too."""
+    """By what arrived in the time, and what was lost after it had taken its own."""
     one_way = crossed.conditions.direction(crossed.direction)
     packets = crossed.transport == "packets"
     size_bytes = LARGE_BYTES + HEADERS_BYTES if packets else SEGMENT_BLOCK_BYTES
     sent_ns = [sent_ns for number, sent_ns in crossed.sent if phase_of(number) == RATE]
     expected = one_way.bytes_per_s or 0.0
-    measured = None
+    measured, note = None, ""
     if sent_ns:
         begin_s = (sent_ns[0] - crossed.start_ns) / 1e9 + RATE_SETTLES_S + one_way.mean_delay_ms / 1e3
         end_s = (sent_ns[-1] - crossed.start_ns) / 1e9
@@ -158,9 +162,12 @@ def _rate(crossed: Crossed) -> Row:
         live_s = end_s - begin_s if outages is None else outages.to_live(end_s) - outages.to_live(begin_s)
         moments = [_at(one_way, begin_s + (end_s - begin_s) * index / _SAMPLES) for index in range(_SAMPLES)]
         expected = _mean(moment.bytes_per_s or 0.0 for moment in moments)
-        lost = _mean(moment.loss for moment in moments) if packets else 0.0
+        lost = _mean(moment.loss for moment in moments) if packets and crossed.lost_take_their_turn else 0.0
         if came_s and live_s > 0 and lost < 1:
             measured = len(came_s) * size_bytes / live_s / (1 - lost)
+        offered = len(sent_ns) * size_bytes * 1e9 / max(1, sent_ns[-1] - sent_ns[0])
+        if offered < expected:
+            note = f"only {offered * 8 / 1e6:.1f} Mbit/s were sent: this computer is too slow or too busy to tell"
     return Row(
         quantity="rate",
         direction=crossed.direction,
@@ -168,6 +175,7 @@ def _rate(crossed: Crossed) -> Row:
         expected=expected * 8 / 1e6,
         measured=None if measured is None else measured * 8 / 1e6,
         allowed=RATE_TOLERANCE * expected * 8 / 1e6,
+        note=note,
     )
 
 

@@ -25,6 +25,7 @@ MTU_BYTES = 1500
 _log = logging.getLogger(__name__)
 _NAMESPACES = Path("/var/run/netns")
 _TUN = Path("/dev/net/tun")
+_IPV6 = Path("/proc/sys/net/ipv6")
 _OWN_NAME = re.compile(r"relod-(\d+)-(?:local|remote)")
 _COMMAND_TIMEOUT_S = 10.0
 
@@ -105,8 +106,10 @@ class NamespaceHosts:
         """Give the host's device its address."""
         name = namespace_name(host)
         other: Host = "remote" if host == "local" else "local"
-        # Without an IPv6 address the host sends nothing of its own accord: every byte counted is a service's.
-        run_command("ip", "-n", name, "link", "set", DEVICE, "mtu", str(MTU_BYTES), "addrgenmode", "none")
+        run_command("ip", "-n", name, "link", "set", DEVICE, "mtu", str(MTU_BYTES))
+        if _IPV6.exists():
+            # Without an IPv6 address the host sends nothing of its own accord: every byte counted is a service's.
+            run_command("ip", "-n", name, "link", "set", DEVICE, "addrgenmode", "none")
         address = ("addr", "add", self.addresses[host], "peer", self.addresses[other])
         run_command("ip", "-n", name, *address, "dev", DEVICE)
         run_command("ip", "-n", name, "link", "set", DEVICE, "up")
