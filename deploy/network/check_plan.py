@@ -31,6 +31,8 @@ DELAY_TOLERANCE, LOSS_TOLERANCE, RATE_TOLERANCE = 0.10, 0.20, 0.10
 """Relative."""
 
 _CONNECTIONS = 8
+_LEAST_GAP_S = 0.005
+_LEAST_DELAY_BLOCKS = 400
 _MAX_DELAY_PHASE_S = 32.0
 _MAX_LOSS_PHASE_S = 20.0
 _RATE_PHASE_S = 2.5
@@ -105,7 +107,7 @@ def _mean_loss(one_way: DirectionConditions) -> float:
 
 
 def _delay_packets(one_way: DirectionConditions) -> Phase:
-    gap_s = max(0.01, 4 * one_way.jitter_ms / 1e3)
+    gap_s = max(_LEAST_GAP_S, 4 * one_way.jitter_ms / 1e3)
     blocks = _delay_blocks_needed(one_way, NetworkConditions(one_way, one_way), "packets", gap_s)
     return Phase(DELAY, blocks, SMALL_BYTES, gap_s)
 
@@ -113,7 +115,7 @@ def _delay_packets(one_way: DirectionConditions) -> Phase:
 def _delay_blocks(conditions: NetworkConditions, direction: Direction) -> Phase:
     one_way = conditions.direction(direction)
     late_s = retransmission_s(conditions, direction) if _loss_variance(one_way) else 0.0
-    gap_s = max(0.01, 4 * one_way.jitter_ms / 1e3 + 1.5 * late_s) / _CONNECTIONS
+    gap_s = max(_LEAST_GAP_S, 4 * one_way.jitter_ms / 1e3 + 1.5 * late_s) / _CONNECTIONS
     blocks = _delay_blocks_needed(one_way, conditions, "stream", gap_s)
     return Phase(DELAY, blocks, SMALL_BYTES, gap_s, connections=_CONNECTIONS)
 
@@ -127,7 +129,7 @@ def _delay_blocks_needed(
     blocks = math.ceil((SIGMAS * error_s / allowed_s) ** 2) if allowed_s else 0
     if one_way.trace is not None:
         blocks = max(blocks, math.ceil(one_way.trace.length_s / gap_s))
-    return max(100, min(blocks, math.floor(_MAX_DELAY_PHASE_S / gap_s)))
+    return max(_LEAST_DELAY_BLOCKS, min(blocks, math.floor(_MAX_DELAY_PHASE_S / gap_s)))
 
 
 def _loss_blocks_needed(one_way: DirectionConditions) -> int:

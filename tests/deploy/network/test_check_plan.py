@@ -45,7 +45,7 @@ def test_small_packets_fill_neither_a_slow_link_nor_a_short_queue() -> None:
 
 def test_each_direction_has_its_own_plan() -> None:
     conditions = NetworkConditions(DirectionConditions(), DirectionConditions(delay_ms=20, jitter_ms=10))
-    assert plan(conditions, "uplink", "packets")[0].gap_s == 0.01
+    assert plan(conditions, "uplink", "packets")[0].gap_s == 0.005
     assert plan(conditions, "downlink", "packets")[0].gap_s == 0.04
 
 
