@@ -82,7 +82,11 @@ def add_check_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of jitter and loss (default: %(default)s)")
 
 
-def run_check(parsed: argparse.Namespace, say: Callable[[str], None] = print) -> int:
+def _say(text: str) -> None:
+    print(text, flush=True)  # line by line into a pipe, too: it takes minutes
+
+
+def run_check(parsed: argparse.Namespace, say: Callable[[str], None] = _say) -> int:
     """Check what was asked for; returns the exit code.
 
     Raises:
