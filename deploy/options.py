@@ -18,7 +18,16 @@ from common.errors import ConfigError
 from common.topics import ROBOT_BRIDGE
 from deploy.computers import check_is_ours, check_pair, checked_address
 from deploy.hosts import host_names, load_host
-from deploy.network import HOSTS, PRESETS, Host, NetworkConditions, load_network, parse_network
+from deploy.network import (
+    HOSTS,
+    LINK_PREFERENCES,
+    PRESETS,
+    Host,
+    LinkPreference,
+    NetworkConditions,
+    load_network,
+    parse_network,
+)
 from deploy.network.conditions import DIRECTIONS
 from deploy.placement import Placement, load_placement, mode_names
 from deploy.plan import RunRequest, split_overrides
@@ -73,6 +82,8 @@ class LaunchOptions:
     """Only write the configurations to this folder."""
     side: Side | None = None
     """None: all services run on this computer."""
+    network_backend: LinkPreference = "auto"
+    """How the network is emulated."""
 
 
 def parse_options(arguments: Sequence[str] | None = None) -> LaunchOptions:
@@ -109,7 +120,9 @@ def parse_options(arguments: Sequence[str] | None = None) -> LaunchOptions:
         overrides=tuple(for_services),
     )
     write_config = options.write_config.absolute() if options.write_config else None
-    return LaunchOptions(request, network, conditions, options.base_port, write_config, side)
+    return LaunchOptions(
+        request, network, conditions, options.base_port, write_config, side, network_backend=options.network_backend
+    )
 
 
 def _side(options: argparse.Namespace, placement: Placement) -> Side:
@@ -143,7 +156,9 @@ def choose_network(
     conditions = load_network(name_or_path or "ideal")
     name = name_or_path if name_or_path in PRESETS else Path(name_or_path or "ideal").stem
     if overrides:
-        conditions = parse_network(_overridden(name_or_path or "ideal", overrides))
+        # A trace's path starts from the file, like in the file; without one, from where the user is.
+        directory = Path() if name_or_path is None or name_or_path in PRESETS else Path(name_or_path).parent
+        conditions = parse_network(_overridden(name_or_path or "ideal", overrides), directory=directory)
         name = f"{name}, changed"
     if placement.spans_hosts:
         return name, conditions
@@ -202,6 +217,12 @@ def _parser() -> argparse.ArgumentParser:
         help=f"emulated network between the hosts: {', '.join(PRESETS)}, or a TOML file with a table [network]",
     )
     parser.add_argument("--host-budget", metavar="HOST|FILE", help=HOST_BUDGET_HELP)
+    parser.add_argument(
+        "--network-backend",
+        choices=LINK_PREFERENCES,
+        default="auto",
+        help="how the network is emulated (default: %(default)s, namespaces where they can be made, else the relay)",
+    )
     parser.add_argument("--run-dir", type=Path, metavar="DIR", help="folder of the run's record (default: in runs/)")
     parser.add_argument(
         "--set",

@@ -94,7 +94,13 @@ def launch(options: LaunchOptions, stop: StopSignals, console: Console) -> int:
         plan_run(request, port_map, NoLink(), options.conditions)
         run_dir.mkdir(parents=True, exist_ok=True)
         needs = crossings(request.placement, port_map)
-        with open_link(options.conditions, needs=needs, run_dir=run_dir, seed=request.seed or 0) as network_link:
+        with open_link(
+            options.conditions,
+            needs=needs,
+            run_dir=run_dir,
+            prefer=options.network_backend,
+            seed=request.seed or 0,
+        ) as network_link:
             configurations = plan_run(request, port_map, network_link, options.conditions)
             paths = write_tables(run_dir / "config", configurations)
             run_file(options, configurations, network_link).write(run_dir)

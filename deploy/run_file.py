@@ -49,7 +49,7 @@ class RunFile:
     network: str
     """Name of the network's conditions; ``none`` if nothing crosses a network."""
     backend: str
-    """How the network is emulated: ``namespaces``, ``relay`` or ``none``."""
+    """How the network is emulated: ``namespaces``, ``netem``, ``relay`` or ``none``."""
     placement: dict[str, str]
     """Service -> host."""
     conditions: dict[str, Any] = field(default_factory=dict)

@@ -3,25 +3,27 @@
 from deploy.network.conditions import (
     DIRECTIONS,
     HOSTS,
-    PRESETS,
     Direction,
     DirectionConditions,
     Host,
     NetworkConditions,
-    load_network,
-    parse_network,
 )
 from deploy.network.errors import LinkFailedError, LinkUnavailable
 from deploy.network.link import Crossing, NetworkLink, NoLink
 from deploy.network.namespaces import NamespaceLink
-from deploy.network.opening import LinkPreference, open_link
+from deploy.network.netem_link import NetemLink
+from deploy.network.opening import LINK_PREFERENCES, LinkPreference, open_link
 from deploy.network.part import NetworkPart
+from deploy.network.presets import PRESETS
 from deploy.network.relay_link import RelayLink
 from deploy.network.schedule import DropCause, OutageTimes, PacketSchedule, StreamSchedule, direction_random
+from deploy.network.table import load_network, parse_network
+from deploy.network.trace import Trace, read_trace
 
 __all__ = [
     "DIRECTIONS",
     "HOSTS",
+    "LINK_PREFERENCES",
     "PRESETS",
     "Crossing",
     "Direction",
@@ -32,6 +34,7 @@ __all__ = [
     "LinkPreference",
     "LinkUnavailable",
     "NamespaceLink",
+    "NetemLink",
     "NetworkConditions",
     "NetworkLink",
     "NetworkPart",
@@ -40,8 +43,10 @@ __all__ = [
     "PacketSchedule",
     "RelayLink",
     "StreamSchedule",
+    "Trace",
     "direction_random",
     "load_network",
     "open_link",
     "parse_network",
+    "read_trace",
 ]

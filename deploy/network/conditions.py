@@ -1,7 +1,7 @@
-"""The ``[network]`` table: how a WiFi-like link between the hosts ``local`` and ``remote`` behaves.
+"""How a WiFi-like link between the hosts ``local`` and ``remote`` behaves.
 
-Delay, jitter, loss, rate and queue belong to one direction. Outages belong to the whole link: a radio that is
-gone is gone for both.
+Delay, jitter, loss, rate, queue and trace belong to one direction. Outages belong to the whole link: a radio that is
+gone is gone for both. :mod:`deploy.network.table` reads conditions from a file.
 """
 
 from __future__ import annotations
@@ -10,11 +10,10 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
-from common.config import read_toml
 from common.errors import ConfigError
+from deploy.network.trace import Trace
 
 Host = Literal["local", "remote"]
 Direction = Literal["uplink", "downlink"]
@@ -22,37 +21,13 @@ Direction = Literal["uplink", "downlink"]
 HOSTS: tuple[Host, Host] = ("local", "remote")
 DIRECTIONS: tuple[Direction, Direction] = ("uplink", "downlink")
 
+SEGMENT_BYTES = 1448
+"""What a TCP segment carries at an MTU of 1500."""
+
 
 def direction_from(host: Host) -> Direction:
     """The direction that traffic sent by ``host`` takes."""
     return "uplink" if host == "local" else "downlink"
-
-
-def _check_direction_key(key: str, value: object, where: str) -> None:
-    if key == "rate_mbit" and value is None:
-        return
-    if key == "loss":
-        _check_number(f"{where}.loss", value, "a fraction between 0 and 1", upper=1.0)
-    elif key == "rate_mbit":
-        _check_number(f"{where}.{key}", value, "Mbit/s >= 0 (0: unlimited)")
-    else:
-        _check_number(f"{where}.{key}", value, "milliseconds >= 0")
-
-
-def _check_outages(every_s: object, length_s: object, where: str) -> None:
-    every = _check_number(f"{where}.outage_every_s", every_s, "seconds >= 0")
-    length = _check_number(f"{where}.outage_s", length_s, "seconds >= 0")
-    if length > 0 and length >= every:
-        raise ConfigError(f"{where}.outage_s = {length_s!r}: expected less than outage_every_s = {every_s!r}")
-
-
-def _check_number(key: str, value: object, expected: str, upper: float = math.inf) -> float:
-    # bool is an int in Python, but ``loss = true`` is a mistake.
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ConfigError(f"{key} = {value!r}: expected {expected}")
-    if not math.isfinite(value) or not 0 <= value <= upper:
-        raise ConfigError(f"{key} = {value!r}: expected {expected}")
-    return float(value)
 
 
 @dataclass(frozen=True)
@@ -62,23 +37,55 @@ class DirectionConditions:
     delay_ms: float = 0.0
     """Mean one-way delay, ms, on top of the time a packet waits in the queue and takes at the rate."""
     jitter_ms: float = 0.0
-    """Standard deviation of the delay, ms. Packets are never reordered, so in a dense stream a slow packet
-    holds up those behind it and the mean delay rises above ``delay_ms``."""
+    """Standard deviation of the delay, ms, before what would be negative becomes 0. Packets are never reordered, so in
+    a dense stream a slow packet holds up those behind it and the mean delay rises above ``delay_ms``."""
     loss: float = 0.0
     """Fraction of packets lost on the air, 0..1."""
     rate_mbit: float | None = None
-    """Mbit/s of IP packets; 0 or None: unlimited."""
+    """Mbit/s of IP packets; None or infinity: unlimited."""
     queue_ms: float = 200.0
     """Longest time a packet may wait for its turn, ms; one that would wait longer is dropped."""
+    queue_packets: int = 0
+    """Most packets that may wait for their turn; one more is dropped. 0: only ``queue_ms`` bounds the queue."""
+    jitter_correlation: float = 0.0
+    """Correlation of one packet's delay with the next one's, 0..1 (below 1)."""
+    loss_burst_packets: float = 0.0
+    """Mean length of a burst, packets; 0: each packet is lost or not whatever befell the others. Bursts are the bad
+    state of Gilbert's and Elliott's channel (Elliott 1963); ``loss`` stays the mean over bursts and the rest."""
+    loss_in_burst: float = 1.0
+    """Fraction of packets lost within a burst."""
+    loss_between_bursts: float = 0.0
+    """Fraction of packets lost outside of bursts."""
+    trace: Trace | None = None
+    """Delay, loss and rate over time; what it says replaces ``delay_ms``, ``loss`` and ``rate_mbit``."""
 
     def __post_init__(self) -> None:
-        for item in dataclasses.fields(self):
-            _check_direction_key(item.name, getattr(self, item.name), where="network")
+        values = {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
+        for key, value in values.items():
+            check_key(key, value, where="network")
+        check_together(values, where="network")
+
+    @property
+    def mean_delay_ms(self) -> float:
+        """Mean of the one-way delay, over a trace's time where there is one, ms."""
+        if self.trace is None or self.trace.delay_ms is None:
+            return self.delay_ms
+        return self.trace.mean(self.trace.delay_ms)
 
     @property
     def bytes_per_s(self) -> float | None:
-        """The rate, bytes/s; None: unlimited."""
-        return self.rate_mbit * 1e6 / 8 if self.rate_mbit else None
+        """The rate, bytes/s; the mean of a trace's; None: unlimited."""
+        if self.trace is not None and self.trace.rate_mbit is not None:
+            return self.trace.mean(self.trace.rate_mbit) * 1e6 / 8
+        return bytes_per_s(self.rate_mbit)
+
+    def to_table(self) -> dict[str, Any]:
+        """The keys and values of this direction's table; a trace with its rows."""
+        values = {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
+        if self.trace is None:
+            del values["trace"]
+            return values
+        return {**values, "trace": self.trace.to_table(), "trace_end": self.trace.end}
 
 
 @dataclass(frozen=True)
@@ -95,87 +102,130 @@ class NetworkConditions:
     """How long nothing gets through, s; 0: no outages."""
 
     def __post_init__(self) -> None:
-        _check_outages(self.outage_every_s, self.outage_s, where="network")
+        check_outages(self.outage_every_s, self.outage_s, where="network")
 
     def direction(self, direction: Direction) -> DirectionConditions:
         return self.uplink if direction == "uplink" else self.downlink
 
+    @property
+    def stops(self) -> tuple[float, Trace] | None:
+        """When the first trace that does not loop is over, s after the link's start, and which; None: never."""
+        stopping = [
+            trace for one_way in (self.uplink, self.downlink) if (trace := one_way.trace) and trace.end == "stop"
+        ]
+        first = min(stopping, key=lambda trace: trace.length_s, default=None)
+        return None if first is None else (first.length_s, first)
+
     def to_table(self) -> dict[str, Any]:
         """The table that ``parse_network`` turns back into equal conditions."""
-        return dataclasses.asdict(self)
+        directions = {name: self.direction(name).to_table() for name in DIRECTIONS}
+        return {**directions, "outage_every_s": self.outage_every_s, "outage_s": self.outage_s}
 
 
-def _both(direction: DirectionConditions, outage_every_s: float = 0.0, outage_s: float = 0.0) -> NetworkConditions:
-    return NetworkConditions(direction, direction, outage_every_s, outage_s)
+def bytes_per_s(rate_mbit: float | None) -> float | None:
+    """A rate in bytes/s; None: unlimited."""
+    return None if rate_mbit is None or math.isinf(rate_mbit) else rate_mbit * 1e6 / 8
 
 
-PRESETS: dict[str, NetworkConditions] = {
-    "ideal": _both(DirectionConditions()),
-    "wifi_office": _both(DirectionConditions(delay_ms=3.0, jitter_ms=2.0, loss=0.005, rate_mbit=40.0)),
-    "wifi_bad": _both(DirectionConditions(delay_ms=20.0, jitter_ms=15.0, loss=0.02, rate_mbit=12.0)),
-    "outage": _both(DirectionConditions(delay_ms=3.0, rate_mbit=20.0), outage_every_s=20.0, outage_s=1.0),
-}
-"""Named conditions, the same in each direction."""
-
-_DIRECTION_KEYS = tuple(f.name for f in dataclasses.fields(DirectionConditions))
-_OUTAGE_KEYS = ("outage_every_s", "outage_s")
-
-
-def load_network(name_or_path: str | Path) -> NetworkConditions:
-    """Conditions by the name of a preset, or from the ``[network]`` table of a TOML file."""
-    if str(name_or_path) in PRESETS:
-        return PRESETS[str(name_or_path)]
-    path = Path(name_or_path)
-    if not path.is_file():
-        raise ConfigError(f"network = {str(name_or_path)!r}: expected {_preset_names()}, or the path of a TOML file")
-    document = read_toml(path)
-    if "network" not in document:
-        raise ConfigError(f"{path}: expected a table [network], found {', '.join(document) or 'nothing'}")
-    return parse_network(document["network"], where=f"{path}: network")
-
-
-def parse_network(table: Mapping[str, Any], where: str = "network") -> NetworkConditions:
-    """Conditions from a ``[network]`` table.
-
-    ``preset`` gives the values to start from (default: ``ideal``), keys of the table itself override both
-    directions, and those of ``[network.uplink]`` and ``[network.downlink]`` override one. ``where`` begins
-    the key in errors.
-    """
-    _check_table(table, where, ("preset", *DIRECTIONS, *_DIRECTION_KEYS, *_OUTAGE_KEYS))
-    preset = table.get("preset", "ideal")
-    if not isinstance(preset, str) or preset not in PRESETS:
-        raise ConfigError(f"{where}.preset = {preset!r}: expected {_preset_names()}")
-    start = PRESETS[preset]
-    shared = {key: table[key] for key in _DIRECTION_KEYS if key in table}
-    directions = {}
-    for name in DIRECTIONS:
-        overrides = table.get(name, {})
-        _check_table(overrides, f"{where}.{name}", _DIRECTION_KEYS)
-        # A wrong value is reported under the key that set it, so the shared keys are checked before the
-        # overrides.
-        base = _replace_direction(start.direction(name), shared, where)
-        directions[name] = _replace_direction(base, overrides, f"{where}.{name}")
-    every_s = table.get("outage_every_s", start.outage_every_s)
-    length_s = table.get("outage_s", start.outage_s)
-    _check_outages(every_s, length_s, where)
-    return NetworkConditions(directions["uplink"], directions["downlink"], every_s, length_s)
+def check_key(key: str, value: object, where: str) -> None:
+    """Check the value of one key of a direction, apart from the others."""
+    match key:
+        case "trace":
+            if value is not None and not isinstance(value, Trace):
+                raise ConfigError(f"{where}.trace = {value!r}: expected a trace")
+        case "rate_mbit":
+            expected = "Mbit/s > 0 (unlimited: inf)"
+            if value is not None and value != math.inf and _check_number(f"{where}.{key}", value, expected) == 0:
+                raise ConfigError(f"{where}.{key} = {value!r}: expected {expected}")
+        case "loss" | "loss_in_burst" | "loss_between_bursts":
+            _check_number(f"{where}.{key}", value, "a fraction between 0 and 1", upper=1.0)
+        case "jitter_correlation":
+            expected = "a correlation of at least 0 and less than 1"
+            if _check_number(f"{where}.{key}", value, expected, upper=1.0) == 1:
+                raise ConfigError(f"{where}.{key} = {value!r}: expected {expected}")
+        case "loss_burst_packets":
+            expected = "a mean length of at least 1 packet (0: no bursts)"
+            if 0 < _check_number(f"{where}.{key}", value, expected) < 1:
+                raise ConfigError(f"{where}.{key} = {value!r}: expected {expected}")
+        case "queue_packets":
+            expected = "a whole number of packets >= 0 (0: any)"
+            if not isinstance(value, int) or _check_number(f"{where}.{key}", value, expected) < 0:
+                raise ConfigError(f"{where}.{key} = {value!r}: expected {expected}")
+        case _:
+            _check_number(f"{where}.{key}", value, "milliseconds >= 0")
 
 
-def _replace_direction(base: DirectionConditions, changes: Mapping[str, Any], where: str) -> DirectionConditions:
-    for key, value in changes.items():
-        _check_direction_key(key, value, where)
-    return dataclasses.replace(base, **changes)
+def check_together(values: Mapping[str, Any], where: str) -> None:
+    """Refuse values of one direction that contradict each other. Each has passed :func:`check_key`."""
+    trace: Trace | None = values["trace"]
+    _check_jitter(values, trace, where)
+    if values["queue_packets"] and values["rate_mbit"] in (None, math.inf) and not (trace and trace.rate_mbit):
+        raise ConfigError(
+            f"{where}.queue_packets = {values['queue_packets']!r}: without rate_mbit nothing ever waits; expected 0"
+        )
+    losses = trace.loss if trace and trace.loss is not None else (values["loss"],)
+    if not values["loss_burst_packets"]:
+        for key, default in (("loss_in_burst", 1.0), ("loss_between_bursts", 0.0)):
+            if values[key] != default:
+                raise ConfigError(f"{where}.{key} = {values[key]!r}: there are no bursts; expected loss_burst_packets")
+        return
+    if not any(losses):
+        raise ConfigError(
+            f"{where}.loss_burst_packets = {values['loss_burst_packets']!r}: nothing is lost; expected loss > 0, "
+            "the mean over bursts and the rest"
+        )
+    for loss in losses:
+        _check_bursts(loss, values, where)
 
 
-def _preset_names() -> str:
-    return f"one of the presets {', '.join(PRESETS)}"
+def _check_jitter(values: Mapping[str, Any], trace: Trace | None, where: str) -> None:
+    jitter_ms, correlation = values["jitter_ms"], values["jitter_correlation"]
+    if correlation and not jitter_ms:
+        raise ConfigError(f"{where}.jitter_correlation = {correlation!r}: there is no jitter; expected jitter_ms > 0")
+    least_ms = min(trace.delay_ms) if trace and trace.delay_ms is not None else values["delay_ms"]
+    if jitter_ms > least_ms:
+        whose = f"the least delay in {trace.name}" if trace and trace.delay_ms is not None else "delay_ms"
+        raise ConfigError(
+            f"{where}.jitter_ms = {jitter_ms!r}: expected at most {whose} = {least_ms!r}; no delay is negative, so "
+            "with more the mean would not be what was asked for"
+        )
 
 
-def _check_table(table: object, where: str, known: tuple[str, ...]) -> None:
-    if not isinstance(table, Mapping):
-        raise ConfigError(f"{where} = {table!r}: expected a table")
-    for key, value in table.items():
-        if key in known:
-            continue
-        hint = "; outages belong to both directions: set them in [network]" if key in _OUTAGE_KEYS else ""
-        raise ConfigError(f"{where}.{key} = {value!r}: unknown key, expected one of {', '.join(known)}{hint}")
+def _check_bursts(loss: float, values: Mapping[str, Any], where: str) -> None:
+    if loss in (0, 1):  # in a trace: nothing is lost for a while, or everything
+        return
+    inside, outside = values["loss_in_burst"], values["loss_between_bursts"]
+    if not outside < loss < inside:
+        raise ConfigError(
+            f"{where}.loss = {loss!r}: expected more than loss_between_bursts = {outside!r} and less than "
+            f"loss_in_burst = {inside!r}, between which it is the mean"
+        )
+    share = burst_share(loss, inside, outside)
+    least = share / (1 - share)
+    if values["loss_burst_packets"] < least:
+        raise ConfigError(
+            f"{where}.loss_burst_packets = {values['loss_burst_packets']!r}: expected at least {least:.3g}, for a loss "
+            f"of {loss!r} takes bursts {share:.0%} of the time"
+        )
+
+
+def burst_share(loss: float, inside: float, outside: float) -> float:
+    """Fraction of packets that must fall into bursts for the mean loss to be ``loss``."""
+    return (loss - outside) / (inside - outside)
+
+
+def check_outages(every_s: object, length_s: object, where: str) -> None:
+    """Refuse outages that are not times, or that leave nothing between them."""
+    every = _check_number(f"{where}.outage_every_s", every_s, "seconds >= 0")
+    length = _check_number(f"{where}.outage_s", length_s, "seconds >= 0")
+    if length > 0 and length >= every:
+        raise ConfigError(f"{where}.outage_s = {length_s!r}: expected less than outage_every_s = {every_s!r}")
+
+
+def _check_number(key: str, value: object, expected: str, upper: float = math.inf) -> float:
+    # bool is an int in Python, but ``loss = true`` is a mistake.
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ConfigError(f"{key} = {value!r}: expected {expected}")
+    if not math.isfinite(value) or not 0 <= value <= upper:
+        raise ConfigError(f"{key} = {value!r}: expected {expected}")
+    return float(value)

@@ -7,6 +7,7 @@ import os
 import select
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,6 +32,7 @@ class LinkProcess:
         self._part_path = run_dir / "network.json"
         self._log_path = run_dir / "network.log"
         self._process: subprocess.Popen[bytes] | None = None
+        self._start_monotonic_ns = 0
 
     def start(self, arguments: Sequence[str]) -> dict[str, Any]:
         """Start the process and return what it says when it is ready.
@@ -40,22 +42,26 @@ class LinkProcess:
         self._part_path.parent.mkdir(parents=True, exist_ok=True)
         command = [
             *(sys.executable, "-m", self._module),
-            *("--conditions", json.dumps(self._conditions.to_table())),
             *("--part", str(self._part_path), "--seed", str(self._seed), "--parent-pid", str(os.getpid())),
             *arguments,
         ]
         # A session of its own: Ctrl-C on the launcher must not cut the link before the services have said
         # goodbye.
-        with self._log_path.open("wb") as log:
+        with self._log_path.open("wb") as log, tempfile.TemporaryFile("w+") as table:
+            # A file, and not an argument nor a pipe: the rows of a trace may be more than either takes.
+            json.dump(self._conditions.to_table(), table)
+            table.seek(0)
             self._process = subprocess.Popen(
                 command,
-                stdin=subprocess.DEVNULL,
+                stdin=table,
                 stdout=subprocess.PIPE,
                 stderr=log,
-                env={**os.environ, "PYTHONPATH": _python_path()},
+                env={**os.environ, "PYTHONPATH": python_path()},
                 start_new_session=True,
             )
-        return self._wait_until_ready(self._process)
+        ready = self._wait_until_ready(self._process)
+        self._start_monotonic_ns = self.part().start_monotonic_ns
+        return ready
 
     def part(self) -> NetworkPart:
         """The link's part of the record: about a second old, and final once the process has been stopped."""
@@ -65,9 +71,11 @@ class LinkProcess:
             raise LinkFailedError(f"{self._part_path}: not there; the link has never been up") from error
 
     def failure(self) -> str | None:
-        """Why the process ended by itself; None while it runs, and after it was stopped."""
-        if self._process is None or self._process.poll() is None:
+        """Why the link is over: its process has ended by itself, or a trace that stops. None once it was stopped."""
+        if self._process is None:
             return None
+        if self._process.poll() is None:
+            return trace_over(self._conditions, self._start_monotonic_ns)
         return f"{self._module} ended with exit code {self._process.returncode}: {self._log_tail()}"
 
     def stop(self) -> None:
@@ -108,6 +116,20 @@ class LinkProcess:
         return f"{lines[-1]} (all of it: {self._log_path})" if lines else f"it left nothing in {self._log_path}"
 
 
-def _python_path() -> str:
+def trace_over(conditions: NetworkConditions, start_monotonic_ns: int) -> str | None:
+    """That a trace which stops is over for a link that started then; None if none is.
+
+    The link itself goes on with the last values: the services can still say goodbye.
+    """
+    if conditions.stops is None:
+        return None
+    end_s, trace = conditions.stops
+    if time.monotonic_ns() - start_monotonic_ns < end_s * 1e9:
+        return None
+    return f"the trace {trace.name} is over after {end_s:g} s, and trace_end = 'stop'; 'loop' begins it again"
+
+
+def python_path() -> str:
+    """``PYTHONPATH`` of a process that runs this project's modules, wherever it is started."""
     inherited = os.environ.get("PYTHONPATH")
     return f"{_REPOSITORY}{os.pathsep}{inherited}" if inherited else str(_REPOSITORY)

@@ -17,8 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from common.errors import ConfigError
-from deploy.network.conditions import NetworkConditions, parse_network
+from common.priority import run_before_others
+from deploy.network.conditions import NetworkConditions
+from deploy.network.table import parse_network
 
+LINK_PRIORITY = 1
+"""Of SCHED_RR: a packet is not late because someone learns. The bridge still comes first."""
 _PR_SET_PDEATHSIG = 1
 _PR_SET_TIMERSLACK = 29
 
@@ -36,7 +40,7 @@ class LinkProcessSettings:
 
 def add_link_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of every link process."""
-    parser.add_argument("--conditions", required=True, help="the [network] table, as JSON")
+    parser.epilog = "The [network] table is read from standard input, as JSON."
     parser.add_argument("--part", type=Path, required=True, help="file to write the link's part of the record to")
     parser.add_argument("--seed", type=int, default=0, help="seed of jitter and loss")
     parser.add_argument("--parent-pid", type=int, default=os.getppid(), help="process to end with")
@@ -45,9 +49,9 @@ def add_link_arguments(parser: argparse.ArgumentParser) -> None:
 def read_settings(parser: argparse.ArgumentParser, parsed: argparse.Namespace) -> LinkProcessSettings:
     """The options of :func:`add_link_arguments`, checked."""
     try:
-        conditions = parse_network(json.loads(parsed.conditions))
+        conditions = parse_network(json.load(sys.stdin))
     except (json.JSONDecodeError, ConfigError) as error:
-        parser.error(f"--conditions: {error}")
+        parser.error(f"standard input: {error}")
     return LinkProcessSettings(conditions, parsed.part, parsed.seed, parsed.parent_pid)
 
 
@@ -59,8 +63,7 @@ def prepare_link_process(parent_pid: int) -> None:
         sys.exit("the process that started this link has ended")
     # Timers may fire up to 50 us late by default, and a link without any delay is measured in tens of them.
     libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, -15)
+    run_before_others(LINK_PRIORITY)
     # Packets and their bookkeeping form no cycles; a collection would only be a pause.
     gc.disable()
 

@@ -1,4 +1,4 @@
-"""Two network namespaces joined by the packet link: the emulation to trust, for those who may use it."""
+"""Two network namespaces, and the packet link that joins them: the emulation to trust, for those who may use it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from deploy.network.conditions import HOSTS, Direction, Host, NetworkConditions
 from deploy.network.errors import LinkFailedError, LinkUnavailable
@@ -25,12 +25,13 @@ MTU_BYTES = 1500
 _log = logging.getLogger(__name__)
 _NAMESPACES = Path("/var/run/netns")
 _TUN = Path("/dev/net/tun")
+_IPV6 = Path("/proc/sys/net/ipv6")
 _OWN_NAME = re.compile(r"relod-(\d+)-(?:local|remote)")
 _COMMAND_TIMEOUT_S = 10.0
 
 
-class NamespaceLink:
-    """Each host is a network namespace of its own; a process carries the packets between them.
+class NamespaceHosts:
+    """Each host is a network namespace of its own; what joins them is the subclasses' business.
 
     The hosts reach each other and themselves, and nothing else: whoever wants to talk to their services has
     to be started with ``command_prefix`` too. One launcher can hold one such link at a time.
@@ -39,24 +40,16 @@ class NamespaceLink:
     addresses: ClassVar[Mapping[Host, str]] = {"local": "10.213.77.1", "remote": "10.213.77.2"}
     """Address of each host. The same in every run: namespaces do not see each other."""
 
-    def __init__(self, conditions: NetworkConditions, run_dir: Path, seed: int = 0) -> None:
-        self._process = LinkProcess("deploy.network.tun", conditions, run_dir, seed)
+    def __init__(self) -> None:
         self._created: list[str] = []
         self._final_bytes: dict[Direction, int] | None = None
 
     def __enter__(self) -> Self:
-        require_namespaces()
         remove_stale_namespaces()
         try:
             for host in HOSTS:
                 self._create(host)
-            self._process.start(
-                [
-                    *("--local", str(_NAMESPACES / namespace_name("local"))),
-                    *("--remote", str(_NAMESPACES / namespace_name("remote"))),
-                    *("--device", DEVICE),
-                ]
-            )
+            self._join()
         except BaseException:
             self._remove()
             raise
@@ -84,7 +77,62 @@ class NamespaceLink:
     def kernel_bytes(self) -> dict[Direction, int] | None:
         if not self._created:
             return self._final_bytes
-        return {"uplink": _sent_bytes("local"), "downlink": _sent_bytes("remote")}
+        return {"uplink": self._sent_bytes("local"), "downlink": self._sent_bytes("remote")}
+
+    def _join(self) -> None:
+        """Join the two namespaces; each needs a device :data:`DEVICE`."""
+        raise NotImplementedError
+
+    def _stop(self) -> None:
+        """End what joins them; harmless if it was never begun."""
+        raise NotImplementedError
+
+    def _sent_bytes(self, host: Host) -> int:
+        """Bytes of IP packets that the host has sent into the link."""
+        return int(device_statistics(host)["tx"]["bytes"])
+
+    def _create(self, host: Host) -> None:
+        name = namespace_name(host)
+        if (_NAMESPACES / name).exists():
+            raise LinkUnavailable(
+                f"the network namespace {name} exists already: this launcher has another link open, "
+                f"or else remove it with: ip netns delete {name}"
+            )
+        self._created.append(name)  # first: an interrupted command may have made it all the same
+        run_command("ip", "netns", "add", name)
+        run_command("ip", "-n", name, "link", "set", "lo", "up")
+
+    def _set_up(self, host: Host) -> None:
+        """Give the host's device its address."""
+        name = namespace_name(host)
+        other: Host = "remote" if host == "local" else "local"
+        run_command("ip", "-n", name, "link", "set", DEVICE, "mtu", str(MTU_BYTES))
+        if _IPV6.exists():
+            # Without an IPv6 address the host sends nothing of its own accord: every byte counted is a service's.
+            run_command("ip", "-n", name, "link", "set", DEVICE, "addrgenmode", "none")
+        address = ("addr", "add", self.addresses[host], "peer", self.addresses[other])
+        run_command("ip", "-n", name, *address, "dev", DEVICE)
+        run_command("ip", "-n", name, "link", "set", DEVICE, "up")
+
+    def _remove(self) -> None:
+        try:
+            self._stop()
+        finally:
+            while self._created:
+                _delete(self._created.pop())
+
+
+class NamespaceLink(NamespaceHosts):
+    """The hosts are joined by a process that carries their packets, :mod:`deploy.network.tun`."""
+
+    def __init__(self, conditions: NetworkConditions, run_dir: Path, seed: int = 0) -> None:
+        super().__init__()
+        self._process = LinkProcess("deploy.network.tun", conditions, run_dir, seed)
+
+    def __enter__(self) -> Self:
+        require_namespaces()
+        require_tun()
+        return super().__enter__()
 
     def part(self) -> NetworkPart:
         return self._process.part()
@@ -92,29 +140,20 @@ class NamespaceLink:
     def failure(self) -> str | None:
         return self._process.failure()
 
-    def _create(self, host: Host) -> None:
-        name = namespace_name(host)
-        other: Host = "remote" if host == "local" else "local"
-        if (_NAMESPACES / name).exists():
-            raise LinkUnavailable(
-                f"the network namespace {name} exists already: this launcher has another link open, "
-                f"or else remove it with: ip netns delete {name}"
-            )
-        self._created.append(name)  # first: an interrupted command may have made it all the same
-        _ip("netns", "add", name)
-        _ip("-n", name, "link", "set", "lo", "up")
-        _ip("-n", name, "tuntap", "add", "dev", DEVICE, "mode", "tun")
-        # Without an IPv6 address the host sends nothing of its own accord: every byte counted is a service's.
-        _ip("-n", name, "link", "set", DEVICE, "mtu", str(MTU_BYTES), "addrgenmode", "none")
-        _ip("-n", name, "addr", "add", self.addresses[host], "peer", self.addresses[other], "dev", DEVICE)
-        _ip("-n", name, "link", "set", DEVICE, "up")
+    def _join(self) -> None:
+        for host in HOSTS:
+            run_command("ip", "-n", namespace_name(host), "tuntap", "add", "dev", DEVICE, "mode", "tun")
+            self._set_up(host)
+        self._process.start(
+            [
+                *("--local", str(_NAMESPACES / namespace_name("local"))),
+                *("--remote", str(_NAMESPACES / namespace_name("remote"))),
+                *("--device", DEVICE),
+            ]
+        )
 
-    def _remove(self) -> None:
-        try:
-            self._process.stop()
-        finally:
-            while self._created:
-                _delete(self._created.pop())
+    def _stop(self) -> None:
+        self._process.stop()
 
 
 def namespace_name(host: Host) -> str:
@@ -123,16 +162,20 @@ def namespace_name(host: Host) -> str:
 
 
 def require_namespaces() -> None:
-    """Raise :class:`LinkUnavailable` if this process cannot make network namespaces and TUN devices."""
+    """Raise :class:`LinkUnavailable` if this process cannot make network namespaces."""
     if shutil.which("ip") is None:
         raise LinkUnavailable("network namespaces need the command 'ip': install iproute2")
+    if os.geteuid() != 0:
+        raise LinkUnavailable("network namespaces need root: run the launcher with sudo, or choose the relay")
+
+
+def require_tun() -> None:
+    """Raise :class:`LinkUnavailable` if there are no TUN devices."""
     if not _TUN.exists():
         raise LinkUnavailable(
             f"the packet link needs {_TUN}: load the kernel module 'tun', or start the container with "
             "--device /dev/net/tun --cap-add NET_ADMIN --cap-add SYS_ADMIN"
         )
-    if os.geteuid() != 0:
-        raise LinkUnavailable("network namespaces need root: run the launcher with sudo, or choose the relay")
 
 
 def remove_stale_namespaces() -> list[str]:
@@ -157,22 +200,24 @@ def _alive(pid: int) -> bool:
 
 def _delete(name: str) -> None:
     try:
-        _ip("netns", "delete", name)
+        run_command("ip", "netns", "delete", name)
     except LinkUnavailable as error:
         if (_NAMESPACES / name).exists():  # else another launcher has been faster with a stale one
             _log.warning("%s", error)
 
 
-def _sent_bytes(host: Host) -> int:
+def device_statistics(host: Host) -> dict[str, Any]:
+    """The kernel's counters of the host's device: ``tx`` and ``rx``, each with ``bytes`` and ``packets``."""
     try:
-        report = json.loads(_ip("-n", namespace_name(host), "-s", "-j", "link", "show", "dev", DEVICE))
+        text = run_command("ip", "-n", namespace_name(host), "-s", "-j", "link", "show", "dev", DEVICE)
     except LinkUnavailable as error:
         raise LinkFailedError(f"the kernel's counters of {host} cannot be read: {error}") from error
-    return int(report[0]["stats64"]["tx"]["bytes"])
+    statistics: dict[str, Any] = json.loads(text)[0]["stats64"]
+    return statistics
 
 
-def _ip(*arguments: str) -> str:
-    command = ["ip", *arguments]
+def run_command(*command: str) -> str:
+    """Run a command of iproute2 and return what it printed; :class:`LinkUnavailable` if it fails."""
     try:
         # A session of its own: Ctrl-C must not interrupt the removal of what has been created.
         finished = subprocess.run(

@@ -6,15 +6,17 @@ import contextlib
 import logging
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from deploy.network.conditions import NetworkConditions
 from deploy.network.errors import LinkUnavailable
 from deploy.network.link import Crossing, NetworkLink, NoLink
 from deploy.network.namespaces import NamespaceLink
+from deploy.network.netem_link import NetemLink
 from deploy.network.relay_link import RelayLink
 
-LinkPreference = Literal["auto", "namespaces", "relay"]
+LinkPreference = Literal["auto", "namespaces", "netem", "relay"]
+LINK_PREFERENCES: tuple[LinkPreference, ...] = get_args(LinkPreference)
 
 _log = logging.getLogger(__name__)
 
@@ -32,7 +34,8 @@ def open_link(
 
     ``needs`` are the crossings that the services' placement asks for; without any, or without
     ``conditions``, there is nothing to emulate and the link is a :class:`NoLink`. ``auto`` takes
-    namespaces, or else the relay, with a warning; ``namespaces`` raises :class:`LinkUnavailable` instead.
+    namespaces, or else the relay, with a warning; ``namespaces`` raises :class:`LinkUnavailable` instead. ``netem``,
+    which is less exact, is never chosen for anyone.
     ``run_dir`` receives ``network.json``, the link's part of the record, and ``network.log``.
     """
     crossings = tuple(needs)
@@ -41,6 +44,8 @@ def open_link(
             yield stack.enter_context(NoLink())
         elif prefer == "relay":
             yield stack.enter_context(RelayLink(conditions, run_dir, crossings, seed))
+        elif prefer == "netem":
+            yield stack.enter_context(NetemLink(conditions, run_dir))
         else:
             yield _enter_best(stack, conditions, run_dir, crossings, prefer, seed)
 

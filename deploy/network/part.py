@@ -60,7 +60,7 @@ class NetworkPart:
     """Everything the link knows about its run so far."""
 
     kind: str
-    """``namespaces`` (packets) or ``relay`` (TCP payload)."""
+    """``namespaces`` or ``netem`` (packets), or ``relay`` (TCP payload)."""
     start_monotonic_ns: int
     """When the link started: outages and schedules count from here."""
     written_monotonic_ns: int

@@ -8,12 +8,10 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 
-from deploy.network.conditions import Direction, NetworkConditions
+from deploy.network.conditions import SEGMENT_BYTES, Direction, NetworkConditions
 from deploy.network.part import DirectionCounts
 from deploy.network.schedule import StreamSchedule, direction_random
 
-_SEGMENT_BYTES = 1448
-"""What a TCP segment carries at an MTU of 1500."""
 _READ_BYTES = 32 * 1024
 _MAX_WAITING_BYTES = 4 * 1024 * 1024
 """Bound on what one way of a connection holds, for links whose rate does not bound it."""
@@ -26,11 +24,10 @@ class RelayedDirection:
 
     def __init__(self, conditions: NetworkConditions, direction: Direction, seed: int) -> None:
         one_way = conditions.direction(direction)
-        self.queue_s = one_way.queue_ms / 1e3
         self.schedule = StreamSchedule(conditions, direction, direction_random(seed, direction))
-        self.split = bool(one_way.rate_mbit or one_way.loss)
-        """Whether segments matter: without rate and loss, bytes that came together stay together."""
         self.limited = one_way.bytes_per_s is not None
+        self.split = self.limited or one_way.loss > 0 or one_way.trace is not None
+        """Whether segments matter: without rate and loss, bytes that came together stay together."""
         self._counts = DirectionCounts()
 
     def counts(self) -> DirectionCounts:
@@ -80,7 +77,7 @@ class Way:
         """The source has sent ``data``."""
         if self.ended:
             return
-        step = _SEGMENT_BYTES if self.direction.split else len(data)
+        step = SEGMENT_BYTES if self.direction.split else len(data)
         now_s = self._now_s()
         for begin in range(0, len(data), step):
             segment = data[begin : begin + step]
@@ -110,9 +107,10 @@ class Way:
         if self.ended:
             return
         backlog_s = self.direction.schedule.backlog_s(now_s) if self.direction.limited else 0.0
-        self._choose_reading(backlog_s)
+        queue_s = self.direction.schedule.queue_s(now_s)
+        self._choose_reading(backlog_s > queue_s)
         wake_s = self._waiting[0][0] if self._waiting and self.sink is not None else math.inf
-        excess_s = backlog_s - self.direction.queue_s
+        excess_s = backlog_s - queue_s
         if excess_s > 0:  # nothing of this way may be waiting when others have filled the queue
             wake_s = min(wake_s, now_s + max(excess_s, _MIN_PAUSE_S))
         if wake_s < math.inf:
@@ -147,10 +145,10 @@ class Way:
             self.ended = True
             self._on_end()
 
-    def _choose_reading(self, backlog_s: float) -> None:
+    def _choose_reading(self, queue_full: bool) -> None:
         if self.source is None or self.source.is_closing():
             return
-        full = self.sink_full or backlog_s > self.direction.queue_s or self._waiting_bytes > _MAX_WAITING_BYTES
+        full = self.sink_full or queue_full or self._waiting_bytes > _MAX_WAITING_BYTES
         if full and self.source.is_reading():
             self.source.pause_reading()
         elif not full and not self.source.is_reading():

@@ -9,9 +9,11 @@ from __future__ import annotations
 import enum
 import math
 import random
+from collections import deque
 from dataclasses import dataclass
 
-from deploy.network.conditions import Direction, NetworkConditions
+from deploy.network.channel import Channel
+from deploy.network.conditions import SEGMENT_BYTES, Direction, NetworkConditions
 
 
 class DropCause(enum.Enum):
@@ -20,7 +22,7 @@ class DropCause(enum.Enum):
     LOSS = "loss"
     """Lost on the air, after it had taken its time at the rate."""
     QUEUE = "queue"
-    """It would have waited longer than ``queue_ms``."""
+    """It would have waited longer than ``queue_ms``, or behind ``queue_packets`` others."""
     OUTAGE = "outage"
     """It was sent, queued or in flight while the link was silent."""
     WRITE = "write"
@@ -89,18 +91,18 @@ class PacketSchedule:
     """One direction of a link that may lose packets but never reorders them.
 
     A packet waits behind those before it, takes size / rate on the air, may be lost there, and arrives one
-    delay later. An outage loses every packet that is queued, in flight or sent while it lasts.
+    delay later. An outage loses every packet that is queued, in flight or sent while it lasts. Where a trace
+    changes the rate, a packet goes out at the one that holds when its turn comes; its delay and its chance of being
+    lost are those of when it was offered.
     """
 
     def __init__(self, conditions: NetworkConditions, direction: Direction, rng: random.Random) -> None:
         one_way = conditions.direction(direction)
-        self._delay_s = one_way.delay_ms / 1e3
-        self._jitter_s = one_way.jitter_ms / 1e3
-        self._loss = one_way.loss
-        self._bytes_per_s = one_way.bytes_per_s
+        self._channel = Channel(one_way, rng)
         self._queue_s = one_way.queue_ms / 1e3
+        self._queue_packets = one_way.queue_packets
         self._outages = OutageTimes.from_conditions(conditions)
-        self._rng = rng
+        self._waiting: deque[float] = deque()
         self._free_s = 0.0
         self._last_delivery_s = 0.0
         self.max_queue_delay_s = 0.0
@@ -110,26 +112,32 @@ class PacketSchedule:
         """Send a packet at ``arrival_s``, never earlier than the one before; when it arrives, or why it does not."""
         if self._outages is not None and self._outages.silent(arrival_s):
             return DropCause.OUTAGE
+        turn_s = arrival_s
         departure_s = arrival_s
-        wait_s = 0.0
-        if self._bytes_per_s is not None:
-            wait_s = max(0.0, self._free_s - arrival_s)
-            if wait_s > self._queue_s:
+        if self._channel.limited:
+            turn_s = max(arrival_s, self._free_s)
+            if turn_s - arrival_s > self._queue_s or self._queue_is_full(arrival_s, turn_s):
                 return DropCause.QUEUE
-            departure_s += wait_s + size_bytes / self._bytes_per_s
-        delivery_s = departure_s + self._delay_s
-        if self._jitter_s:
-            delivery_s = max(departure_s, self._rng.gauss(delivery_s, self._jitter_s))
-        delivery_s = max(delivery_s, self._last_delivery_s)
+            departure_s = turn_s + size_bytes / self._channel.bytes_per_s(turn_s)
+        delivery_s = max(departure_s + self._channel.draw_delay_s(arrival_s), self._last_delivery_s)
         # Checked before the queue moves on: what an outage will lose must not delay what is sent after it.
         if self._outages is not None and self._outages.touch(arrival_s, delivery_s):
             return DropCause.OUTAGE
         self._free_s = departure_s
-        self.max_queue_delay_s = max(self.max_queue_delay_s, wait_s)
-        if self._loss and self._rng.random() < self._loss:
+        if self._queue_packets and turn_s > arrival_s:
+            self._waiting.append(turn_s)
+        self.max_queue_delay_s = max(self.max_queue_delay_s, turn_s - arrival_s)
+        if self._channel.draw_loss(arrival_s):
             return DropCause.LOSS
         self._last_delivery_s = delivery_s
         return delivery_s
+
+    def _queue_is_full(self, arrival_s: float, turn_s: float) -> bool:
+        if not self._queue_packets or turn_s <= arrival_s:
+            return False
+        while self._waiting and self._waiting[0] <= arrival_s:
+            self._waiting.popleft()
+        return len(self._waiting) >= self._queue_packets
 
 
 @dataclass(frozen=True)
@@ -146,8 +154,8 @@ class StreamSchedule:
     """One direction of a link seen from above TCP: nothing is lost, what would be lost comes late.
 
     A lost segment comes ``retransmission_s`` later: the round trip, and a quarter more, until the sender
-    notices and sends it again. During an outage everything waits: the schedule runs on live time, which
-    then stands still.
+    notices and sends it again; where a trace then loses everything, once it does not any more. During an outage
+    everything waits: the schedule runs on live time, which then stands still.
     """
 
     MIN_RETRANSMISSION_S = 0.01
@@ -155,34 +163,30 @@ class StreamSchedule:
 
     def __init__(self, conditions: NetworkConditions, direction: Direction, rng: random.Random) -> None:
         one_way = conditions.direction(direction)
-        self._delay_s = one_way.delay_ms / 1e3
-        self._jitter_s = one_way.jitter_ms / 1e3
-        self._loss = one_way.loss
-        self._bytes_per_s = one_way.bytes_per_s
+        self._channel = Channel(one_way, rng)
+        self._queue_s = one_way.queue_ms / 1e3
+        self._queue_packets = one_way.queue_packets
         self._outages = OutageTimes.from_conditions(conditions)
-        self._rng = rng
         self._free_s = 0.0
-        round_trip_s = (conditions.uplink.delay_ms + conditions.downlink.delay_ms) / 1e3
+        round_trip_s = (conditions.uplink.mean_delay_ms + conditions.downlink.mean_delay_ms) / 1e3
         self.retransmission_s = max(self.MIN_RETRANSMISSION_S, 1.25 * round_trip_s)
-        """What a lost segment is late by, s; forever if the link loses everything."""
-        if self._loss >= 1:
-            self.retransmission_s = float("inf")
+        """What a lost segment is late by, s; more while everything is lost."""
         self.max_queue_delay_s = 0.0
         """Longest time that a segment waited for its turn, s, outages not counted."""
 
     def offer(self, arrival_s: float, size_bytes: int) -> Segment:
         """Send a segment at ``arrival_s``, never earlier than the one before."""
         departure_s = self._after(arrival_s, 0.0)
-        if self._bytes_per_s is not None:
+        if self._channel.limited:
             self.max_queue_delay_s = max(self.max_queue_delay_s, self.backlog_s(arrival_s))
-            departure_s = self._after(max(arrival_s, self._free_s), size_bytes / self._bytes_per_s)
+            turn_s = max(arrival_s, self._free_s)
+            departure_s = self._after(turn_s, size_bytes / self._channel.bytes_per_s(turn_s))
             self._free_s = departure_s
-        transit_s = self._delay_s
-        if self._jitter_s:
-            transit_s = max(0.0, self._rng.gauss(transit_s, self._jitter_s))
-        retransmitted = self._loss > 0 and self._rng.random() < self._loss
+        transit_s = self._channel.draw_delay_s(arrival_s)
+        retransmitted = self._channel.draw_loss(arrival_s)
         if retransmitted:
-            transit_s += self.retransmission_s
+            noticed_s = departure_s + self.retransmission_s
+            transit_s += self._channel.passable_s(noticed_s) - departure_s
         return Segment(self._after(departure_s, transit_s), retransmitted)
 
     def backlog_s(self, time_s: float) -> float:
@@ -190,6 +194,12 @@ class StreamSchedule:
         if self._outages is None:
             return max(0.0, self._free_s - time_s)
         return max(0.0, self._outages.to_live(self._free_s) - self._outages.to_live(time_s))
+
+    def queue_s(self, time_s: float) -> float:
+        """The longest backlog that the queue can hold, s."""
+        if not (self._queue_packets and self._channel.limited):
+            return self._queue_s
+        return min(self._queue_s, self._queue_packets * SEGMENT_BYTES / self._channel.bytes_per_s(time_s))
 
     def _after(self, start_s: float, live_s: float) -> float:
         return start_s + live_s if self._outages is None else self._outages.after(start_s, live_s)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from common.errors import ConfigError
-from deploy.network import PRESETS
+from deploy.network import PRESETS, read_trace
 from deploy.options import choose_network, default_run_name, make_run_id, parse_options
 from deploy.placement import load_placement
 
@@ -78,6 +78,27 @@ def test_overrides_of_the_network_win_over_its_file(tmp_path: Path) -> None:
     assert (changed.uplink.loss, changed.downlink.loss) == (0.1, 0.1)
     assert (changed.uplink.rate_mbit, changed.downlink.rate_mbit) == (3, None)
     assert (changed.uplink.delay_ms, changed.outage_every_s) == (4, 9)
+
+
+def test_a_trace_is_found_next_to_its_file_whatever_else_is_overridden(tmp_path: Path) -> None:
+    (tmp_path / "office.csv").write_text("time_s,loss\n0,0\n1,1\n", encoding="utf-8")
+    path = tmp_path / "net.toml"
+    path.write_text('[network]\ntrace = "office.csv"\n', encoding="utf-8")
+    _, conditions = choose_network(
+        load_placement("remote_only"), str(path), {"delay_ms": 4, "uplink.trace_end": "stop"}
+    )
+    assert conditions is not None
+    assert (conditions.uplink.trace, conditions.downlink.trace) == (
+        read_trace(tmp_path / "office.csv", end="stop"),
+        read_trace(tmp_path / "office.csv"),
+    )
+    assert conditions.uplink.delay_ms == 4
+
+
+def test_the_network_is_emulated_as_asked_for() -> None:
+    assert parse_options(["remote_only", "--task", "dot_reacher"]).network_backend == "auto"
+    asked = ["remote_only", "--task", "dot_reacher", "--network-backend", "netem"]
+    assert parse_options(asked).network_backend == "netem"
 
 
 def test_an_unknown_network_is_refused_by_name() -> None:

@@ -21,6 +21,7 @@ from deploy.network import (
     NetworkPart,
     NoLink,
     RelayLink,
+    Trace,
 )
 
 ServeEcho = Callable[[NetworkLink, Host, int], None]
@@ -162,6 +163,19 @@ def test_a_crossing_that_was_not_announced_cannot_be_dialled(tmp_path: Path, por
 def test_a_crossing_joins_two_hosts() -> None:
     with pytest.raises(ValueError, match="7447 stays on local"):
         Crossing("local", "local", 7447)
+
+
+def test_a_trace_that_stops_ends_the_link_and_one_that_loops_does_not(tmp_path: Path, port: int) -> None:
+    # 10,000 rows: more than a command line or a pipe would take.
+    rows = tuple(number / 5e6 for number in range(10_000))
+    for end, reason in (("stop", "the trace t.csv is over after 0.002 s, and trace_end = 'stop'"), ("loop", None)):
+        trace = Trace("t.csv", rows, loss=(0.0,) * len(rows), end=end)
+        conditions = NetworkConditions(DirectionConditions(trace=trace))
+        with RelayLink(conditions, tmp_path, [Crossing("local", "remote", port)]) as network_link:
+            time.sleep(0.002)  # the trace's own time
+            failure = network_link.failure()
+            assert (failure or "").startswith(reason or "")
+            assert (failure is None) == (reason is None)
 
 
 def test_a_relay_that_died_is_a_failure(tmp_path: Path, port: int) -> None:

@@ -57,6 +57,25 @@ def test_a_packet_that_would_wait_longer_than_the_queue_is_dropped() -> None:
     assert schedule.offer(0.001, 1000) == pytest.approx(0.004)
 
 
+def test_a_packet_that_would_wait_behind_too_many_is_dropped() -> None:
+    schedule = _packets(DirectionConditions(rate_mbit=8, queue_packets=2))
+    outcomes = [schedule.offer(0.0, 1000) for _ in range(5)]
+    # One on the air and two that wait.
+    assert outcomes[:3] == pytest.approx([0.001, 0.002, 0.003])
+    assert outcomes[3:] == [DropCause.QUEUE, DropCause.QUEUE]
+    # At 1.5 ms one of them is on the air and one waits; the next has room, and the one after it has not.
+    assert schedule.offer(0.0015, 1000) == pytest.approx(0.004)
+    assert schedule.offer(0.0015, 1000) is DropCause.QUEUE
+    assert schedule.offer(0.1, 1000) == pytest.approx(0.101)
+
+
+def test_a_stream_may_wait_for_as_many_segments_as_the_queue_holds() -> None:
+    # 1448 bytes take 1.448 ms.
+    assert _stream(DirectionConditions(rate_mbit=8)).queue_s(0.0) == pytest.approx(0.2)
+    assert _stream(DirectionConditions(rate_mbit=8, queue_packets=10)).queue_s(0.0) == pytest.approx(0.01448)
+    assert _stream(DirectionConditions(rate_mbit=8, queue_ms=5, queue_packets=10)).queue_s(0.0) == pytest.approx(0.005)
+
+
 def test_each_direction_has_its_own_conditions() -> None:
     conditions = NetworkConditions(DirectionConditions(delay_ms=1), DirectionConditions(delay_ms=2))
     assert PacketSchedule(conditions, "uplink", random.Random(0)).offer(0.0, 100) == pytest.approx(0.001)
