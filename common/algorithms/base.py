@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from common.algorithms.presets import SACConfig
+from common.algorithms.config import AlgorithmConfig
 from common.messages import PolicyWeights, TaskSpec
 from common.minibatch import Minibatch
 from common.networks.precision import Precision
@@ -36,7 +36,7 @@ class Algorithm(ABC):
     def __init__(
         self,
         spec: TaskSpec,
-        config: SACConfig,
+        config: AlgorithmConfig,
         *,
         seed: int,
         device: str = "cpu",

@@ -44,10 +44,13 @@ def make_minibatch(spec, rng, batch_size=16):
         return rng.integers(0, 256, shape, dtype=np.uint8) if spec.has_camera else None
 
     return Minibatch(
+        rows=2 * np.arange(batch_size),
         frames=frames(),
         proprioception=uniform(spec.proprioception_low, spec.proprioception_high),
         previous_action=uniform(spec.action_low, spec.action_high),
         action=uniform(spec.action_low, spec.action_high),
+        chosen_action=uniform(spec.action_low, spec.action_high),
+        log_probability=rng.normal(-1.4, 0.5, batch_size).astype(np.float32),
         reward=rng.uniform(-2.0, 0.0, batch_size).astype(np.float32),
         terminated=(rng.random(batch_size) < 0.3).astype(np.float32),
         next_frames=frames(),
