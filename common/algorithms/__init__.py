@@ -2,32 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from common.algorithms.table import ALGORITHMS
 from common.errors import ConfigError
 
 if TYPE_CHECKING:
     from common.algorithms.base import Algorithm
 
-
-@dataclass(frozen=True)
-class AlgorithmRow:
-    """One row of the table."""
-
-    learner: str
-    """``module:class`` of the :class:`Algorithm`; needs torch."""
-    presets: str
-    """``module:name`` of its settings by preset; without torch, because actor and replay read them too. Whether they
-    are :class:`OffPolicyConfig` or :class:`OnPolicyConfig` decides which store replay keeps."""
-
-
-ALGORITHMS = {
-    "sac": AlgorithmRow("common.algorithms.sac:SAC", "common.algorithms.sac_config:SAC_PRESETS"),
-    "ppo": AlgorithmRow("common.algorithms.ppo:PPO", "common.algorithms.ppo_config:PPO_PRESETS"),
-}
-"""The table of algorithms. A new one is a file for each of the first two columns, and one line here."""
+__all__ = ["ALGORITHMS", "load_algorithm"]
 
 
 def load_algorithm(name: str) -> type[Algorithm]:

@@ -30,7 +30,7 @@ class Algorithm(ABC):
     """
 
     updates: int
-    """Updates done, those before a resumed checkpoint included."""
+    """Minibatches learnt from, those before a resumed checkpoint included."""
 
     @abstractmethod
     def __init__(
@@ -56,7 +56,10 @@ class Algorithm(ABC):
 
     @abstractmethod
     def update(self, minibatch: Minibatch) -> None:
-        """Learn from one minibatch. Does not wait for the device; keeps no reference to the arrays."""
+        """Learn from one minibatch: of an :class:`OnPolicyConfig`, from a rollout, its transitions in order.
+
+        Keeps no reference to the arrays. Off-policy it does not wait for the device.
+        """
 
     @abstractmethod
     def metrics(self) -> dict[str, float]:

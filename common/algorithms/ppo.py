@@ -119,7 +119,7 @@ class PPO(ActorCritic):
         for _ in range(self._config.epochs):
             measured = [
                 (len(chosen) / size, self._take_gradient_step(rollout.select(chosen)))
-                for chosen in self._shuffle(size).split(self._config.batch_size)
+                for chosen in torch.split(self._shuffle(size), self._config.batch_size)
             ]
         # Of the last epoch: what the update has come to.
         self._metrics |= {name: sum(share * step[name] for share, step in measured) for name in measured[0][1]}  # type: ignore[misc]
@@ -205,7 +205,7 @@ class PPO(ActorCritic):
         size = self._config.batch_size
         portions = [
             self.critic(observation(self.encoder, None if frames is None else frames[at : at + size], portion))
-            for at, portion in zip(range(0, len(vector), size), vector.split(size), strict=True)
+            for at, portion in zip(range(0, len(vector), size), torch.split(vector, size), strict=True)
         ]
         values: npt.NDArray[np.float64] = torch.cat(portions).double().cpu().numpy()
         return values

@@ -7,8 +7,8 @@ from dataclasses import fields, replace
 from importlib import import_module
 from typing import Any
 
-from common.algorithms import ALGORITHMS
 from common.algorithms.config import AlgorithmConfig
+from common.algorithms.table import ALGORITHMS
 from common.errors import ConfigError
 
 

@@ -130,9 +130,9 @@ def test_a_bad_value_for_ppo_is_refused_too(name, value):
 
 
 def test_what_belongs_to_one_algorithm_is_unknown_to_another():
-    with pytest.raises(ConfigError, match="ppo: unknown setting 'replay_ratio'; known: .*rollout_length"):
+    with pytest.raises(ConfigError, match=r"ppo: unknown setting 'replay_ratio'; known: .*rollout_length"):
         resolve_config("ppo", "dot_reacher", {"replay_ratio": 1.0})
-    with pytest.raises(ConfigError, match="sac: unknown setting 'rollout_length'; known: .*replay_ratio"):
+    with pytest.raises(ConfigError, match=r"sac: unknown setting 'rollout_length'; known: .*replay_ratio"):
         resolve_config("sac", "dot_reacher", {"rollout_length": 100})
 
 
