@@ -251,7 +251,8 @@ class Acknowledgement:
     missing: Annotated[Int64Array, Array("int64", ("n", 2))]
     """Half-open ranges [start, end) that are known to exist and have not arrived."""
     updates_owed: Annotated[float, Bounds(low=0.0)]
-    """Replay's unspent update budget, updates; in lockstep the actor waits for it. 0 on other streams."""
+    """What the learner has still to do: unspent updates, or on-policy the transitions of a rollout that it has not
+    answered with a new policy; in lockstep the actor waits for it. 0 on other streams."""
 
 
 @dataclass(frozen=True)

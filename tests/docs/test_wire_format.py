@@ -20,6 +20,7 @@ from common.codec import decode, encode
 from common.frame_stack import FrameStack
 from common.messages import (
     MESSAGES,
+    SCHEMA_VERSION,
     Acknowledgement,
     Action,
     Array,
@@ -78,7 +79,13 @@ def make_array_minibatch() -> ArrayMinibatch:
     rng = np.random.default_rng(1)
     real = {
         name: rng.normal(size=(3, size)).astype(np.float32)
-        for name, size in {"proprioception": 5, "next_proprioception": 5, "action": 2, "previous_action": 2}.items()
+        for name, size in {
+            "proprioception": 5,
+            "next_proprioception": 5,
+            "action": 2,
+            "previous_action": 2,
+            "chosen_action": 2,
+        }.items()
     }
     return ArrayMinibatch(
         learner_incarnation=3,
@@ -88,6 +95,8 @@ def make_array_minibatch() -> ArrayMinibatch:
         frames=rng.integers(0, 256, (9, 6, 8, 3), np.uint8),
         frame_index=rng.integers(0, 9, (3, 4)),
         next_frame_index=rng.integers(0, 9, (3, 4)),
+        rows=np.array([5, 9, 5]),
+        log_probability=np.full(3, -1.5, np.float32),
         reward=np.full(3, -1, np.float32),
         terminated=np.array([0, 1, 0], np.uint8),
         **real,
@@ -276,7 +285,7 @@ def test_a_table_without_an_end_is_refused():
 
 def test_the_table_of_encoder_and_actor_is_what_a_policy_has():
     sizes = {**vars(SPEC.dimensions), "N": 16}
-    rows = table_rows("SAC's policy has")
+    rows = table_rows("`hidden_size`, the policy has")
     for spec in (SPEC, make_spec(camera=False)):
         shapes = {}
         for row in rows:
@@ -379,12 +388,13 @@ def test_a_service_reads_what_the_client_writes(message):
 
 def test_the_client_refuses_another_message_schema_and_dtype():
     client = program("client.py")
-    with pytest.raises(ValueError, match="expected Action of schema 1, got Command of schema 1"):
+    ours, newer = SCHEMA_VERSION, SCHEMA_VERSION + 1
+    with pytest.raises(ValueError, match=f"expected Action of schema {ours}, got Command of schema {ours}"):
         client.decode(encode(Command("stop")), "Action")
-    with pytest.raises(ValueError, match="got Command of schema 2"):
-        client.decode(msgpack.packb({"schema": 2, "message": "Command", "name": "stop"}))
+    with pytest.raises(ValueError, match=f"got Command of schema {newer}"):
+        client.decode(msgpack.packb({"schema": newer, "message": "Command", "name": "stop"}))
     with pytest.raises(ValueError, match="expected a dtype"):
-        client.decode(msgpack.packb({"schema": 1, "message": "X", "x": ["|O", [1], b"12345678"]}))
+        client.decode(msgpack.packb({"schema": ours, "message": "X", "x": ["|O", [1], b"12345678"]}))
 
 
 def test_the_tables_refuse_what_is_not_as_they_say():
