@@ -44,8 +44,9 @@ class RolloutStore(ExperienceStore):
         if not (record["pair"] and record["has_extras"]):
             return  # No transition, or one in which the policy had no choice.
         version = int(record["policy_version"])
-        if version > self._version:
-            self._begin(version)
+        # What the ring no longer holds cannot be learnt from: nobody would ever answer it with a new policy.
+        if version > self._version or self._is_overtaken:
+            self._begin(max(version, self._version))
         if version < self._version or self._is_complete:
             self._dropped += 1
             return
@@ -77,7 +78,11 @@ class RolloutStore(ExperienceStore):
     def _is_complete(self) -> bool:
         return len(self._rows) == self._length
 
+    @property
+    def _is_overtaken(self) -> bool:
+        return bool(self._rows) and not self._ring.valid_pairs(np.array(self._rows[:1], np.int64)).all()
+
     def _begin(self, version: int) -> None:
-        if not self._is_complete:
+        if not (self._is_complete and self._sent):
             self._dropped += len(self._rows)
         self._version, self._rows, self._sent = version, [], False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from common.algorithms.config import AlgorithmConfig
@@ -86,6 +87,7 @@ def test_first_time_steps_of_attempts_are_no_transitions(scene):
 def test_what_the_actor_does_during_the_update_is_dropped_and_counted(scene):
     scene.start()
     scene.steps(LENGTH)
+    assert scene.take() is not None
     scene.steps(3)
     assert scene.counter("dropped_transitions") == 3
     rows = scene.steps(2, version=1)
@@ -93,6 +95,18 @@ def test_what_the_actor_does_during_the_update_is_dropped_and_counted(scene):
     rows += scene.steps(2, version=1)
     assert scene.take() == rows
     assert (scene.counter("rollouts"), scene.counter("dropped_transitions")) == (2, 3)
+
+
+def test_a_rollout_that_the_ring_no_longer_holds_is_replaced_by_one_of_the_same_policy(scene):
+    # Nobody took it, because the learner was not there; without another one there would never be a newer policy.
+    scene.start()
+    scene.steps(LENGTH)
+    rows = scene.steps(120)  # the ring has room for 100
+    taken = scene.take()
+    assert len(taken) == LENGTH
+    assert set(taken) <= set(rows)
+    assert scene.ring.valid_pairs(np.array(taken)).all()
+    assert scene.counter("dropped_transitions") == LENGTH + 120 - LENGTH
 
 
 def test_a_newer_policy_ends_an_unfinished_rollout(scene):
