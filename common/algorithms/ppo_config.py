@@ -42,6 +42,7 @@ class PPOConfig(OnPolicyConfig):
 
 
 _THESIS = PPOConfig()
+# Half the rollout, a quarter of the minibatch and of the width suffice: 20 steps per goal after 34 000 to 39 000 steps.
 _DOT_REACHER = PPOConfig(batch_size=64, hidden_size=256, rollout_length=2048, replay_capacity=20_000)
 
 PPO_PRESETS: dict[str, PPOConfig] = {
