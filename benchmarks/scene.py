@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from common.algorithms.presets import SAC_PRESETS, SACConfig
+from common.algorithms.sac_config import SAC_PRESETS, SACConfig
 from common.messages import ActionSource, Experience, Float32Array, TaskSpec, TimeStep, UInt8Array
 from common.policies.weights import initial_parameters
 

@@ -233,7 +233,7 @@ class Action:
 
 @dataclass(frozen=True)
 class PolicyExtras:
-    """What the actor knows of the action that was applied; travels with the Experience."""
+    """What the actor knows of its answer to the TimeStep before, applied or not; travels with the Experience."""
 
     chosen_action: Annotated[Float32Array, Array("float32", ("A",))]
     """Action before clipping, physical units."""
@@ -245,7 +245,7 @@ class PolicyExtras:
 
 @dataclass(frozen=True)
 class Experience:
-    """A TimeStep as it came, plus the policy's extras for the action that led into it."""
+    """A TimeStep as it came, plus the policy's extras for the action that was chosen on the TimeStep before."""
 
     actor_incarnation: Count
     """Start of the actor process, nanoseconds since 1970."""
@@ -254,7 +254,7 @@ class Experience:
     time_step: TimeStep
     """Unchanged."""
     extras: PolicyExtras | None
-    """None where the applied action was no actor's, or an earlier actor's."""
+    """None for the first of an attempt, and where this actor did not answer the TimeStep before."""
 
 
 @dataclass(frozen=True)
@@ -268,7 +268,8 @@ class Acknowledgement:
     missing: Annotated[Int64Array, Array("int64", ("n", 2))]
     """Half-open ranges [start, end) that are known to exist and have not arrived."""
     updates_owed: Annotated[float, Bounds(low=0.0)]
-    """Replay's unspent update budget, updates; in lockstep the actor waits for it. 0 on other streams."""
+    """What the learner has still to do: unspent updates, or on-policy the transitions of a rollout that it has not
+    answered with a new policy; in lockstep the actor waits for it. 0 on other streams."""
 
 
 @dataclass(frozen=True)
@@ -321,6 +322,8 @@ class ArrayMinibatch:
     """Pieces of this minibatch; the fields below ``frames`` are equal in each."""
     frames: Annotated[UInt8Array, Array("uint8", ("n", "H", "W", "C"))]
     """This piece's share of the unique camera frames, in order."""
+    rows: Annotated[Int64Array, Array("int64", ("B",))]
+    """Row ids of the transitions' second experience in the ring: consecutive ones are consecutive transitions."""
     frame_index: Annotated[Int64Array, Array("int64", ("B", "S"))]
     """Observation stacks: indices into all pieces' frames, oldest first."""
     next_frame_index: Annotated[Int64Array, Array("int64", ("B", "S"))]
@@ -333,6 +336,10 @@ class ArrayMinibatch:
     """Of the next observations, physical units."""
     action: Annotated[Float32Array, Array("float32", ("B", "A"))]
     """Applied action, physical units."""
+    chosen_action: Annotated[Float32Array, Array("float32", ("B", "A"))]
+    """Action the policy chose for the observation, before clipping, physical units; zeros where it chose none."""
+    log_probability: Annotated[Float32Array, Array("float32", ("B",))]
+    """Log-density of the chosen action in the normalised action space; 0 where there is none."""
     reward: Annotated[Float32Array, Array("float32", ("B",))]
     """Reward of the cycle between the two observations."""
     terminated: Annotated[UInt8Array, Array("uint8", ("B",))]

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from common.messages import Float32Array, UInt8Array
+from common.messages import Float32Array, Int64Array, UInt8Array
 
 
 class DeviceArray(Protocol):
@@ -32,6 +32,8 @@ class Minibatch:
     The action is the applied one. The previous action is part of the observation; that of o' is ``action`` itself.
     """
 
+    rows: Int64Array
+    """(B,): numbers of the transitions in replay's ring; where one is the last plus 1, its o is the last one's o'."""
     frames: UInt8Array | DeviceArray | None
     """(B, h, w, S * C) uint8: the stack's frames along the channels, oldest first; None without camera."""
     proprioception: Float32Array
@@ -40,6 +42,10 @@ class Minibatch:
     """(B, A); zeros at the start of an attempt."""
     action: Float32Array
     """(B, A)"""
+    chosen_action: Float32Array
+    """(B, A): what the policy chose for o, whether or not it was applied; zeros where it chose nothing."""
+    log_probability: Float32Array
+    """(B,): log-density of the chosen action under the policy that chose it, in the normalised action space."""
     reward: Float32Array
     """(B,)"""
     terminated: Float32Array
@@ -54,6 +60,7 @@ class Minibatch:
         cls,
         first: npt.NDArray[np.void],
         second: npt.NDArray[np.void],
+        rows: Int64Array,
         frames: UInt8Array | DeviceArray | None,
         next_frames: UInt8Array | DeviceArray | None,
     ) -> Minibatch:
@@ -62,14 +69,18 @@ class Minibatch:
         Args:
             first: (B,) rows of o, structured as ``RingLayout.row_dtype``.
             second: (B,) the rows after them.
+            rows: (B,) their numbers.
             frames: of o, stacked and cropped.
             next_frames: of o'.
         """
         return cls(
+            rows=rows,
             frames=frames,
             proprioception=first["proprioception"].copy(),
             previous_action=first["action"].copy(),
             action=second["action"].copy(),
+            chosen_action=second["chosen_action"].copy(),
+            log_probability=second["log_probability"].copy(),
             reward=second["reward"].copy(),
             terminated=second["terminated"].astype(np.float32),
             next_frames=next_frames,

@@ -16,11 +16,12 @@ from typing import Any
 
 from common.errors import RelodError
 from common.record import write_atomically
-from common.topics import ACTOR, LEARNER, ROBOT_BRIDGE
+from common.topics import ACTOR, LEARNER, REPLAY, ROBOT_BRIDGE
 from deploy import parts as run_parts
 from deploy.actions import last_published_ns, outage_ends
 from deploy.curve import draw_learning_curve
 from deploy.episodes import Episode, steps_per_goal
+from deploy.parts import RunParts
 from deploy.run_file import IN_PROCESS
 from deploy.run_record import Record, read_record
 from deploy.summary_text import summary_text
@@ -77,6 +78,7 @@ def summarise(record: Record) -> Summary:
         "updates": _count(parts.greatest(LEARNER, "updates")),
         "policy_pushes": _count(parts.total(LEARNER, "policy_pushes")),
         "policy_version": _count(parts.greatest(LEARNER, "policy_version")),
+        "rollouts": _rollouts(parts),
         "observation_to_action_ms": _observation_to_action_ms(record),
         "outages": _outages(record, notes),
         "bytes_per_key": bytes_per_key(parts.bytes_sent()),
@@ -115,6 +117,14 @@ def _steps_per_goal(
         notes.append("steps_per_goal_last_1000 is null: no goal was reached in the last 1000 steps")
         return None
     return round(value, 3)
+
+
+def _rollouts(parts: RunParts) -> dict[str, int | None] | None:
+    """What an on-policy algorithm learnt from, and what it could not learn from; None for the others."""
+    complete = _count(parts.total(REPLAY, "rollouts"))
+    if complete is None:
+        return None
+    return {"complete": complete, "dropped_transitions": _count(parts.total(REPLAY, "dropped_transitions"))}
 
 
 def _observation_to_action_ms(record: Record) -> dict[str, float] | None:

@@ -73,10 +73,13 @@ def _experience(values: Mapping[str, Any]) -> str:
 
 
 def _learning(values: Mapping[str, Any]) -> str:
-    return (
+    text = (
         f"{_known(values['updates'])} updates, {_known(values['policy_pushes'])} policy pushes, "
         f"policy version {_known(values['policy_version'])}"
     )
+    if (rollouts := values["rollouts"]) is not None:
+        text += f", {rollouts['complete']} rollouts, {_known(rollouts['dropped_transitions'])} transitions dropped"
+    return text
 
 
 def _network(values: Mapping[str, Any]) -> str:

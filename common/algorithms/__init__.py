@@ -5,15 +5,13 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from common.algorithms.table import ALGORITHMS
 from common.errors import ConfigError
 
 if TYPE_CHECKING:
     from common.algorithms.base import Algorithm
 
-ALGORITHMS = {
-    "sac": "common.algorithms.sac:SAC",
-}
-"""Algorithm name -> ``module:class``. A new algorithm is one file, one line here and its presets."""
+__all__ = ["ALGORITHMS", "load_algorithm"]
 
 
 def load_algorithm(name: str) -> type[Algorithm]:
@@ -24,6 +22,6 @@ def load_algorithm(name: str) -> type[Algorithm]:
     """
     if name not in ALGORITHMS:
         raise ConfigError(f"unknown algorithm {name!r}; known: {', '.join(ALGORITHMS)}")
-    module, _, attribute = ALGORITHMS[name].partition(":")
+    module, _, attribute = ALGORITHMS[name].learner.partition(":")
     algorithm: type[Algorithm] = getattr(import_module(module), attribute)
     return algorithm

@@ -11,8 +11,22 @@ from torch import Tensor, nn
 class Adam:
     """torch's fused Adam, which minimises one loss over some of its leaves."""
 
-    def __init__(self, parameters: Mapping[str, nn.Parameter], lr: float, betas: tuple[float, float]) -> None:
-        """Create an optimiser of ``parameters`` (name -> parameter)."""
+    def __init__(
+        self,
+        parameters: Mapping[str, nn.Parameter],
+        lr: float,
+        betas: tuple[float, float],
+        max_gradient_norm: float | None = None,
+    ) -> None:
+        """Create an optimiser of ``parameters`` (name -> parameter).
+
+        Args:
+            parameters: what it optimises.
+            lr: step size.
+            betas: decay rates of the moments.
+            max_gradient_norm: all gradients together are scaled down to this length; None: never.
+        """
+        self._max_gradient_norm = max_gradient_norm
         self._parameters = dict(parameters)
         self._leaves = list(self._parameters.values())
         self._adam = torch.optim.Adam(self._leaves, lr=lr, betas=betas, fused=True)
@@ -34,6 +48,8 @@ class Adam:
             # batched products and of channels_last convolutions come in another order than their parameters.
             same_order = gradient.stride() == leaf.stride()
             leaf.grad = gradient if same_order else torch.empty_like(leaf).copy_(gradient)
+        if self._max_gradient_norm is not None:
+            nn.utils.clip_grad_norm_(self._leaves, self._max_gradient_norm)
         self._adam.step()
 
     def state(self) -> dict[str, Tensor]:

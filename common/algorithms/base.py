@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from common.algorithms.presets import SACConfig
+from common.algorithms.config import AlgorithmConfig
 from common.messages import PolicyWeights, TaskSpec
 from common.minibatch import Minibatch
 from common.networks.precision import Precision
@@ -30,13 +30,13 @@ class Algorithm(ABC):
     """
 
     updates: int
-    """Updates done, those before a resumed checkpoint included."""
+    """Minibatches learnt from, those before a resumed checkpoint included."""
 
     @abstractmethod
     def __init__(
         self,
         spec: TaskSpec,
-        config: SACConfig,
+        config: AlgorithmConfig,
         *,
         seed: int,
         device: str = "cpu",
@@ -56,7 +56,10 @@ class Algorithm(ABC):
 
     @abstractmethod
     def update(self, minibatch: Minibatch) -> None:
-        """Learn from one minibatch. Does not wait for the device; keeps no reference to the arrays."""
+        """Learn from one minibatch: of an :class:`OnPolicyConfig`, from a rollout, its transitions in order.
+
+        Keeps no reference to the arrays. Off-policy it does not wait for the device.
+        """
 
     @abstractmethod
     def metrics(self) -> dict[str, float]:

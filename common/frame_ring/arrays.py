@@ -49,12 +49,15 @@ def array_minibatch(
     pairs, index = pairs.select(left), index[:, left]
     first, second = pairs.first, pairs.second
     columns = {
+        "rows": pairs.rows.copy(),
         "frame_index": index[0],
         "next_frame_index": index[1],
         "proprioception": first["proprioception"].copy(),
         "previous_action": first["action"].copy(),
         "next_proprioception": second["proprioception"].copy(),
         "action": second["action"].copy(),
+        "chosen_action": second["chosen_action"].copy(),
+        "log_probability": second["log_probability"].copy(),
         "reward": second["reward"].copy(),
         "terminated": second["terminated"].copy(),
     }
@@ -114,10 +117,13 @@ def minibatch_from_arrays(
         other = crop_offset if next_crop_offset is None else next_crop_offset
         next_frames = crop_stacks(unique, head.next_frame_index, other, crop_shape)
     return Minibatch(
+        rows=head.rows,
         frames=frames,
         proprioception=head.proprioception,
         previous_action=head.previous_action,
         action=head.action,
+        chosen_action=head.chosen_action,
+        log_probability=head.log_probability,
         reward=head.reward,
         terminated=head.terminated.astype(np.float32),
         next_frames=next_frames,

@@ -71,7 +71,7 @@ class RingReader(RingView):
                 crop_offset if next_crop_offset is None else next_crop_offset,
                 crop_shape,
             )
-        minibatch = Minibatch.of_rows(first, second, frames, next_frames)
+        minibatch = Minibatch.of_rows(first, second, pairs.rows, frames, next_frames)
         return Gathered(minibatch, valid=self.not_overtaken(pairs))
 
 
@@ -83,10 +83,13 @@ def drop_overtaken(gathered: Gathered) -> Minibatch | None:
     if not kept.any():
         return None
     return Minibatch(
+        rows=minibatch.rows[kept],
         frames=None if minibatch.frames is None else minibatch.frames[kept],
         proprioception=minibatch.proprioception[kept],
         previous_action=minibatch.previous_action[kept],
         action=minibatch.action[kept],
+        chosen_action=minibatch.chosen_action[kept],
+        log_probability=minibatch.log_probability[kept],
         reward=minibatch.reward[kept],
         terminated=minibatch.terminated[kept],
         next_frames=None if minibatch.next_frames is None else minibatch.next_frames[kept],

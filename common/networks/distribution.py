@@ -9,6 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+LARGEST_ACTION = 1.0 - 1e-6
+"""What was before the tanh of a float32 beyond this has been lost to rounding."""
+
 
 @dataclass(frozen=True)
 class TanhGaussian:
@@ -31,7 +34,15 @@ class TanhGaussian:
             noise: (B, A) from N(0, 1).
         """
         before_tanh = self.mean + self.log_std.exp() * noise
+        return torch.tanh(before_tanh), self._log_density(before_tanh, noise)
+
+    def log_probability(self, action: Tensor) -> Tensor:
+        """Return the log-densities (B,) of actions (B, A) in [-1, 1], as far from +-1 as :data:`LARGEST_ACTION`."""
+        before_tanh = torch.atanh(action.clamp(-LARGEST_ACTION, LARGEST_ACTION))
+        return self._log_density(before_tanh, (before_tanh - self.mean) * torch.exp(-self.log_std))
+
+    def _log_density(self, before_tanh: Tensor, noise: Tensor) -> Tensor:
         log_gaussian = -0.5 * noise.square() - self.log_std - 0.5 * math.log(2.0 * math.pi)
         # log(1 - tanh(u)^2) = 2 (log 2 - u - softplus(-2 u)): the left side is -inf in float32 from |u| = 9 on.
         log_slope = 2.0 * (math.log(2.0) - before_tanh - functional.softplus(-2.0 * before_tanh))
-        return torch.tanh(before_tanh), (log_gaussian - log_slope).sum(dim=1)
+        return (log_gaussian - log_slope).sum(dim=1)

@@ -12,33 +12,66 @@ from torch.nn import functional
 from common.networks.product import batched_linear, linear
 
 
-class Actor(nn.ModuleList):
-    """Observation vector -> mean and unbounded log standard deviation.
+class Perceptron(nn.ModuleList):
+    """Three layers with ReLU between.
 
     Parameters are named ``0.weight`` (H, inputs), ``0.bias`` ... ``2.bias``.
     """
 
-    def __init__(
-        self, inputs: int, hidden_size: int, action_size: int, *, dtype: torch.dtype, wide: torch.dtype
-    ) -> None:
-        """Create an actor with parameters in ``dtype`` whose hidden-to-hidden layer computes in ``wide``."""
+    def __init__(self, inputs: int, hidden_size: int, outputs: int, *, dtype: torch.dtype, wide: torch.dtype) -> None:
+        """Create layers with parameters in ``dtype``, of which the hidden-to-hidden one computes in ``wide``."""
         super().__init__(
             [
                 nn.Linear(inputs, hidden_size, dtype=dtype),
                 nn.Linear(hidden_size, hidden_size, dtype=dtype),
-                nn.Linear(hidden_size, 2 * action_size, dtype=dtype),
+                nn.Linear(hidden_size, outputs, dtype=dtype),
             ]
         )
         self._wide = wide
 
-    def forward(self, vector: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, inputs) -> two of (B, A)."""
+    def outputs(self, vector: Tensor) -> Tensor:
+        """(B, inputs) -> (B, outputs)."""
         first, hidden, last = self
         assert isinstance(hidden, nn.Linear)
         x = functional.relu_(first(vector)).to(self._wide)
         x = functional.relu_(linear(x, hidden.weight.to(self._wide), hidden.bias.to(self._wide)))
-        mean, log_std = last(x.to(vector.dtype)).chunk(2, dim=1)
+        outputs: Tensor = last(x.to(vector.dtype))
+        return outputs
+
+
+class Actor(Perceptron):
+    """Observation vector -> mean and unbounded log standard deviation; parameters as of :class:`Perceptron`."""
+
+    def __init__(
+        self, inputs: int, hidden_size: int, action_size: int, *, dtype: torch.dtype, wide: torch.dtype
+    ) -> None:
+        """Create an actor; see :class:`Perceptron`."""
+        super().__init__(inputs, hidden_size, 2 * action_size, dtype=dtype, wide=wide)
+
+    def forward(self, vector: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, inputs) -> two of (B, A)."""
+        mean, log_std = self.outputs(vector).chunk(2, dim=1)
         return mean, log_std
+
+
+class StateValue(Perceptron):
+    """Observation vector -> value v of the state; parameters as of :class:`Perceptron`."""
+
+    def __init__(
+        self, inputs: int, hidden_size: int, rng: np.random.Generator, *, dtype: torch.dtype, wide: torch.dtype
+    ) -> None:
+        """Create a critic with random weights from ``rng`` and zero biases; see :class:`Perceptron`."""
+        super().__init__(inputs, hidden_size, 1, dtype=dtype, wide=wide)
+        with torch.no_grad():
+            for layer in self:
+                assert isinstance(layer, nn.Linear)
+                bound = 1.0 / math.sqrt(layer.in_features)
+                layer.weight.copy_(torch.from_numpy(rng.uniform(-bound, bound, tuple(layer.weight.shape))))
+                layer.bias.zero_()
+
+    def forward(self, vector: Tensor) -> Tensor:
+        """(B, inputs) -> (B,)."""
+        return self.outputs(vector).squeeze(1)
 
 
 class TwinQ(nn.Module):

@@ -15,7 +15,7 @@ from services.actor.config import ActorSettings
 ACKNOWLEDGE_S = 0.1
 """Period of the acknowledgement to the bridge."""
 REMEMBERED_ANSWERS = 4096
-"""Answers kept for the experience that will tell that they were applied; more than a journal's repairs need."""
+"""Answers kept for the experience that they belong to; more than a journal's repairs need."""
 
 
 class ExperienceForwarder:
@@ -127,7 +127,10 @@ class ExperienceForwarder:
                 self._ack_publisher.put(encode(acknowledgement))
 
     def _experience(self, time_step: TimeStep) -> Experience:
-        extras = self._answers.get((time_step.incarnation, time_step.answered_seq))
+        # Not the answer whose action was applied, which an earlier TimeStep may have got: what is learnt from is what
+        # the policy chose on an observation, with all that came of it.
+        before = time_step.incarnation, time_step.seq - 1
+        extras = None if time_step.is_first else self._answers.get(before)
         experience = Experience(self._service.incarnation, self.experiences, time_step, extras)
         self.experiences += 1
         return experience

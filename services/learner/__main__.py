@@ -49,11 +49,14 @@ def serve(service: Service, config: LearnerConfig) -> None:
         )
         version = restore(directory, algorithm)
         source: MinibatchSource
+        random_crop = algorithm_config.random_crop
         if settings.access == "map":
             open_ring = partial(DeviceRingReader, device=device) if settings.frames_on_device else RingReader
-            source = MappedMinibatches(service, spec, settings.prefetch, directory / RING_FILE, open_ring)
+            source = MappedMinibatches(
+                service, spec, settings.prefetch, directory / RING_FILE, open_ring, random_crop=random_crop
+            )
         else:
-            source = ReceivedMinibatches(service, spec, settings.prefetch)
+            source = ReceivedMinibatches(service, spec, settings.prefetch, random_crop=random_crop)
         Learner(service, algorithm, algorithm_config, settings, source, version).run()
 
 

@@ -77,7 +77,7 @@ class DeviceRingReader(RingReader):
             self._copy = None
             _keep_on_host(str(error).partition(". ")[0])
             return super().gather(rows, crop_shape, crop_offset, next_crop_offset)
-        return Gathered(Minibatch.of_rows(pairs.first, pairs.second, frames, next_frames), valid)
+        return Gathered(Minibatch.of_rows(pairs.first, pairs.second, pairs.rows, frames, next_frames), valid)
 
     def _catch_up(self, copy: Tensor) -> None:
         """Copy what is new since the last time, at most all that the ring holds."""

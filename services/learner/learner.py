@@ -8,7 +8,7 @@ from pathlib import Path
 
 from common import topics
 from common.algorithms.base import Algorithm
-from common.algorithms.presets import SACConfig
+from common.algorithms.config import AlgorithmConfig
 from common.messages import PolicyWeights
 from common.minibatch import Minibatch
 from common.service import Service
@@ -30,7 +30,7 @@ class Learner:
         self,
         service: Service,
         algorithm: Algorithm,
-        config: SACConfig,
+        config: AlgorithmConfig,
         settings: LearnerSettings,
         source: MinibatchSource,
         policy_version: int,

@@ -18,7 +18,14 @@ import numpy as np
 from common import topics
 from common.codec import encode
 from common.errors import MessageError, RingError
-from common.frame_ring import RingReader, crop_shape, draw_crop_offset, drop_overtaken, minibatch_from_arrays
+from common.frame_ring import (
+    RingReader,
+    central_crop_offset,
+    crop_shape,
+    draw_crop_offset,
+    drop_overtaken,
+    minibatch_from_arrays,
+)
 from common.inbox import Inbox
 from common.messages import ArrayMinibatch, Credit, RowMinibatch, TaskSpec
 from common.minibatch import Minibatch
@@ -33,8 +40,8 @@ CREDIT_S = 0.2
 class MinibatchSource(ABC):
     """Keeps ``prefetch`` minibatches asked for and hands them out in order."""
 
-    def __init__(self, service: Service, spec: TaskSpec, prefetch: int) -> None:
-        self._service, self._spec, self._prefetch = service, spec, prefetch
+    def __init__(self, service: Service, spec: TaskSpec, prefetch: int, *, random_crop: bool = True) -> None:
+        self._service, self._spec, self._prefetch, self._random_crop = service, spec, prefetch, random_crop
         self._crop_shape = crop_shape(spec) if spec.has_camera else None
         self._rng = np.random.default_rng([service.run.seed, service.incarnation])
         self._credit_publisher = service.transport.publisher(topics.CREDIT)
@@ -82,7 +89,9 @@ class MinibatchSource(ABC):
         return True
 
     def _draw_crop(self) -> tuple[int, int]:
-        return draw_crop_offset(self._spec, self._rng) if self._spec.has_camera else (0, 0)
+        if not self._spec.has_camera:
+            return 0, 0
+        return draw_crop_offset(self._spec, self._rng) if self._random_crop else central_crop_offset(self._spec)
 
     def _run(self) -> None:
         clock, sent, next_credit_ns = self._service.clock, (-1, -1), 0
@@ -116,8 +125,10 @@ class MappedMinibatches(MinibatchSource):
         prefetch: int,
         ring: Path,
         open_ring: Callable[[Path], RingReader] = RingReader,
+        *,
+        random_crop: bool = True,
     ) -> None:
-        super().__init__(service, spec, prefetch)
+        super().__init__(service, spec, prefetch, random_crop=random_crop)
         self._path, self._open_ring = ring, open_ring
         self._ring: RingReader | None = None
         self._inbox = _inbox(service, topics.ROW_MINIBATCH, RowMinibatch, self._wake, spec)
@@ -142,8 +153,8 @@ class MappedMinibatches(MinibatchSource):
 class ReceivedMinibatches(MinibatchSource):
     """Everything comes over the network, each camera frame once per minibatch."""
 
-    def __init__(self, service: Service, spec: TaskSpec, prefetch: int) -> None:
-        super().__init__(service, spec, prefetch)
+    def __init__(self, service: Service, spec: TaskSpec, prefetch: int, *, random_crop: bool = True) -> None:
+        super().__init__(service, spec, prefetch, random_crop=random_crop)
         self._parts: list[ArrayMinibatch] = []
         self._inbox = _inbox(service, topics.ARRAY_MINIBATCH, ArrayMinibatch, self._wake, spec)
 

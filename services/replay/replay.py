@@ -4,7 +4,7 @@
 
     Experience ─▶ in order, once ─▶ ring ─▶ Acknowledgement
                                      │
-                     Credit ─▶ budget ─▶ Minibatch
+                      Credit ─▶ store ─▶ Minibatch
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from common import topics
-from common.algorithms.presets import SACConfig
+from common.algorithms.config import AlgorithmConfig
 from common.codec import encode
 from common.errors import MessageError
 from common.frame_ring import RING_FILE, RingWriter
@@ -26,7 +26,7 @@ from common.messages import Credit, Experience, StreamHead, TaskSpec
 from common.service import Service
 from services.replay.config import ReplaySettings
 from services.replay.minibatch_senders import ArraySender, MinibatchSender, RowSender
-from services.replay.sampler import TransitionSampler, UpdateBudget
+from services.replay.store_table import open_store
 
 logger = logging.getLogger(__name__)
 
@@ -39,17 +39,20 @@ ACTOR_LOST_AFTER_S = 5.0
 class Replay:
     """Owns the experience ring; the only one who writes it."""
 
-    def __init__(self, service: Service, spec: TaskSpec, algorithm: SACConfig, settings: ReplaySettings) -> None:
-        self._service, self._settings, self._batch_size = service, settings, algorithm.batch_size
+    def __init__(self, service: Service, spec: TaskSpec, algorithm: AlgorithmConfig, settings: ReplaySettings) -> None:
+        self._service, self._settings = service, settings
         self._ring = RingWriter.create_or_reopen(
             Path(service.run.directory) / RING_FILE, spec, algorithm.replay_capacity, settings.frames_per_row
         )
         self._persisted = self._ring.persisted_counts()
         self._transitions = self._ring.transitions_appended
-        self._budget = UpdateBudget(
-            algorithm.replay_ratio, algorithm.min_size_to_sample, settings.max_surplus, self._transitions
+        self._store = open_store(
+            algorithm,
+            self._ring,
+            max_surplus=settings.max_surplus,
+            rng=np.random.default_rng([service.run.seed, service.incarnation]),
+            learner_version=lambda: int(service.peer_counter(topics.LEARNER, "policy_version")),
         )
-        self._sampler = TransitionSampler(np.random.default_rng([service.run.seed, service.incarnation]))
         self._receiver: OrderedReceiver[Experience] = OrderedReceiver()
         self._experiences = [
             self._inbox(topic, Experience, dimensions=spec.dimensions, capacity=1024)
@@ -68,7 +71,7 @@ class Replay:
         )
         self._credit = Credit(0, 0, 0)
         self._sent = 0
-        self._paid = 0
+        self._sent_once = 0
         self._sent_total = 0
         self._produced_seen: dict[int, int] = {}
         self._copies_refused = 0
@@ -95,7 +98,7 @@ class Replay:
 
     def step(self) -> None:
         """Handle all that has come."""
-        self._store()
+        self._take_experience()
         self._serve_credit()
         self._acknowledge()
 
@@ -105,7 +108,7 @@ class Replay:
             "rows": sum(list(self._persisted.values())),
             "transitions": self._transitions,
             "minibatches": self._sent_total,
-            "owed": self._budget.owed,
+            **self._store.counters(),
             "lost": self._receiver.lost,
             "duplicates": self._receiver.duplicates + self._copies_refused,
         }
@@ -127,10 +130,10 @@ class Replay:
     # ------------------------------------------------------------------ experience
 
     def _keep(self) -> None:
-        self._store()
+        self._take_experience()
         self._acknowledge()
 
-    def _store(self) -> None:
+    def _take_experience(self) -> None:
         for inbox in self._experiences:
             for experience, _ in inbox.take():
                 self._receiver.accept(experience.actor_incarnation, experience.seq, experience)
@@ -141,7 +144,7 @@ class Replay:
 
     def _acknowledge(self) -> None:
         now_ns = self._service.clock.now_ns()
-        if now_ns >= self._next_ack_ns and (ack := self._receiver.acknowledgement(self._budget.owed)):
+        if now_ns >= self._next_ack_ns and (ack := self._receiver.acknowledgement(self._store.owed)):
             self._next_ack_ns = now_ns + self._ack_period_ns
             self._ack_publisher.put(encode(ack))
 
@@ -154,44 +157,42 @@ class Replay:
             self._copies_refused += 1
             return
         try:
-            self._ring.append(experience)
+            row = self._ring.append(experience)
         except MessageError as error:
             self._service.refusals.refuse(topics.EXPERIENCE.name, error)
             return
         self._persisted[step.incarnation] = self._persisted.get(step.incarnation, 0) + 1
-        transitions = self._ring.transitions_appended
-        self._budget.add(transitions - self._transitions)
-        self._transitions = transitions
+        self._transitions = self._ring.transitions_appended
+        self._store.note_row(row)
 
     # ------------------------------------------------------------------ minibatches
 
     def _serve_credit(self) -> None:
         if arrived := self._credits.take_newest():
             self._take_credit(arrived.message)
-        while self._sent < self._credit.want_total and self._budget.owed >= 1.0:
-            if not self._send_minibatch():
-                return
-            if self._sent > self._paid:
-                # A minibatch that is sent again, because it was lost on the way, has been paid for.
-                self._paid = self._sent
-                self._budget.spend()
+        while self._sent < self._credit.want_total and self._send_minibatch():
+            pass
 
     def _take_credit(self, credit: Credit) -> None:
         if credit.learner_incarnation < self._credit.learner_incarnation:
             return
         if credit.learner_incarnation > self._credit.learner_incarnation:
             logger.info("a learner has joined")
-            self._sent = self._paid = credit.received_total
+            self._sent = self._sent_once = credit.received_total
             self._minibatches.forget()
+            self._store.note_new_learner()
         elif credit.received_total < self._sent and self._minibatches.quiet_s() > self._minibatches.lost_after_s:
             self._sent = credit.received_total
         self._credit = credit
 
     def _send_minibatch(self) -> bool:
-        rows = self._sampler.sample(self._ring, self._batch_size)
+        again = self._sent < self._sent_once
+        rows = self._store.next_rows(again=again)
         if rows is None or not self._minibatches.send(rows, self._credit.learner_incarnation, self._sent):
             return False
+        self._store.note_sent(again=again)
         self._sent += 1
+        self._sent_once = max(self._sent_once, self._sent)
         self._sent_total += 1
         return True
 

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import replay
 from benchmarks.scene import recorded_experience, trained_parameters
-from common.algorithms.presets import SACConfig
+from common.algorithms.sac_config import SACConfig
 from common.frame_ring import RingReader
 from common.policies import pack_weights, policy_from_weights
 from tests.reference.plain_policy import PlainPolicy

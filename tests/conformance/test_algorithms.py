@@ -11,7 +11,7 @@ import pytest
 
 from common.algorithms import ALGORITHMS, load_algorithm
 from common.algorithms.base import Algorithm
-from common.algorithms.presets import PRESETS
+from common.algorithms.presets import presets_of
 from common.errors import ConfigError
 from common.policies import policy_from_weights
 from tests.reference.tasks import make_minibatch, make_observation, make_spec
@@ -30,7 +30,7 @@ def spec(request):
 
 
 def make_algorithm(name, spec, seed=0, hidden_size=16):
-    preset = next(iter(PRESETS[name].values()))
+    preset = next(iter(presets_of(name).values()))
     config = replace(preset, hidden_size=hidden_size, encoder_strides=(2, 2, 1, 1))
     return load_algorithm(name)(spec, config, seed=seed)
 

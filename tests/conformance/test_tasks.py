@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from common.algorithms import ALGORITHMS
 from common.algorithms.presets import resolve_config
 from common.codec import decode, encode
 from common.errors import ConfigError
@@ -85,12 +86,13 @@ def test_every_preset_loads_and_describes_itself(name, preset):
         assert min(crop_shape(spec)) >= 1
 
 
-def test_the_algorithm_preset_a_task_asks_for_exists_and_fits_its_frames(name):
+def test_the_presets_a_task_asks_for_exist_for_every_algorithm_and_fit_its_frames(name):
     spec = build(name).spec
-    config = resolve_config("sac", spec.algorithm_presets["sac"], {})
-    if spec.has_camera:
-        height, width, _ = cropped_shape(spec)
-        assert min(map_size(height, width, config.encoder_strides)) >= 1
+    for algorithm in ALGORITHMS:
+        config = resolve_config(algorithm, spec.algorithm_presets[algorithm], {})
+        if spec.has_camera:
+            height, width, _ = cropped_shape(spec)
+            assert min(map_size(height, width, config.encoder_strides)) >= 1
 
 
 def test_the_first_preset_is_the_default(name):

@@ -34,6 +34,7 @@ FIELDS = [
     "updates",
     "policy_pushes",
     "policy_version",
+    "rollouts",
     "observation_to_action_ms",
     "outages",
     "bytes_per_key",
@@ -143,6 +144,7 @@ def test_the_summary_of_a_run_with_several_incarnations(tmp_path: Path) -> None:
         "updates": 2400,
         "policy_pushes": 48,
         "policy_version": 47,
+        "rollouts": None,
         "observation_to_action_ms": {"p50": 4.0, "p99": 5.96},
         "outages": [{"end_s": 20.5, "first_action_s": 0.504}],
         "bytes_per_key": {"action": 100, "status": 10, "timestep": 3000},
@@ -166,6 +168,14 @@ def test_the_summary_of_a_run_with_several_incarnations(tmp_path: Path) -> None:
         ("learner", 150),
     ]
     assert values["service_failures"][-1]["failure"] == "out of memory"
+
+
+def test_rollouts_and_what_was_dropped_between_them_add_up_over_restarts_of_replay(tmp_path: Path) -> None:
+    for incarnation, complete, dropped in ((20, 3, 41), (30, 2, 7)):
+        write_part(tmp_path, "replay", incarnation, counters={"rollouts": complete, "dropped_transitions": dropped})
+    values = summarise(read_record(tmp_path)).values
+    assert values["rollouts"] == {"complete": 5, "dropped_transitions": 48}
+    assert "5 rollouts, 48 transitions dropped" in summary_text(values)
 
 
 def test_rows_that_stand_twice_in_the_ring_are_counted(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from common.frame_encoding import EncodedFrames, FrameEncoding, encode_frames
 from common.frame_stack import FrameStack
 from common.messages import (
     MESSAGES,
+    SCHEMA_VERSION,
     Acknowledgement,
     Action,
     Array,
@@ -80,7 +81,13 @@ def make_array_minibatch() -> ArrayMinibatch:
     rng = np.random.default_rng(1)
     real = {
         name: rng.normal(size=(3, size)).astype(np.float32)
-        for name, size in {"proprioception": 5, "next_proprioception": 5, "action": 2, "previous_action": 2}.items()
+        for name, size in {
+            "proprioception": 5,
+            "next_proprioception": 5,
+            "action": 2,
+            "previous_action": 2,
+            "chosen_action": 2,
+        }.items()
     }
     return ArrayMinibatch(
         learner_incarnation=3,
@@ -90,6 +97,8 @@ def make_array_minibatch() -> ArrayMinibatch:
         frames=rng.integers(0, 256, (9, 6, 8, 3), np.uint8),
         frame_index=rng.integers(0, 9, (3, 4)),
         next_frame_index=rng.integers(0, 9, (3, 4)),
+        rows=np.array([5, 9, 5]),
+        log_probability=np.full(3, -1.5, np.float32),
         reward=np.full(3, -1, np.float32),
         terminated=np.array([0, 1, 0], np.uint8),
         **real,
@@ -285,7 +294,7 @@ def test_a_table_without_an_end_is_refused():
 
 def test_the_table_of_encoder_and_actor_is_what_a_policy_has():
     sizes = {**vars(SPEC.dimensions), "N": 16}
-    rows = table_rows("SAC's policy has")
+    rows = table_rows("`hidden_size`, the policy has")
     for spec in (SPEC, make_spec(camera=False)):
         shapes = {}
         for row in rows:
@@ -388,12 +397,13 @@ def test_a_service_reads_what_the_client_writes(message):
 
 def test_the_client_refuses_another_message_schema_and_dtype():
     client = program("client.py")
-    with pytest.raises(ValueError, match="expected Action of schema 2, got Command of schema 2"):
+    ours, newer = SCHEMA_VERSION, SCHEMA_VERSION + 1
+    with pytest.raises(ValueError, match=f"expected Action of schema {ours}, got Command of schema {ours}"):
         client.decode(encode(Command("stop")), "Action")
-    with pytest.raises(ValueError, match="got Command of schema 3"):
-        client.decode(msgpack.packb({"schema": 3, "message": "Command", "name": "stop"}))
+    with pytest.raises(ValueError, match=f"got Command of schema {newer}"):
+        client.decode(msgpack.packb({"schema": newer, "message": "Command", "name": "stop"}))
     with pytest.raises(ValueError, match="expected a dtype"):
-        client.decode(msgpack.packb({"schema": 2, "message": "X", "x": ["|O", [1], b"12345678"]}))
+        client.decode(msgpack.packb({"schema": ours, "message": "X", "x": ["|O", [1], b"12345678"]}))
 
 
 def test_the_tables_refuse_what_is_not_as_they_say():

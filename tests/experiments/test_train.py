@@ -54,6 +54,25 @@ def test_the_same_options_give_the_same_run_in_any_process(tmp_path):
     assert (tmp_path / "one" / "episodes.csv").read_text().count("\n") > 2
 
 
+def test_ppo_gives_the_same_run_and_loses_a_step_for_each_rollout_at_most(tmp_path):
+    overrides = (
+        "algorithm.hidden_size=32",
+        "algorithm.rollout_length=60",
+        "algorithm.replay_capacity=500",
+        "algorithm.epochs=2",
+        "task.target_half_width=0.4",
+    )
+    runs = [small(tmp_path / name, algorithm="ppo", steps=300, overrides=overrides) for name in ("one", "two")]
+    one, two = (train(run) for run in runs)
+    for file in ("actions.csv", "policy.msgpack"):
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes(), file
+    # When a rollout is complete, one answer of the old policy is on its way; then the actor waits for the new one.
+    rollouts = one["rollouts"]
+    assert rollouts == two["rollouts"]
+    assert 3 <= rollouts["complete"] == one["updates"] == one["policy_version"]
+    assert rollouts["dropped_transitions"] <= rollouts["complete"]
+
+
 def test_another_seed_gives_another_run(tmp_path):
     for seed in (0, 1):
         train(small(tmp_path / str(seed), seed=seed))

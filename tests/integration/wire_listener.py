@@ -254,12 +254,13 @@ def check_experiences(experiences, steps, actions):
     compared = answered = 0
     for experience in experiences.values():
         step, extras = experience["time_step"], experience["extras"]
-        assert (extras is None) == (step["answered_seq"] < 0)
+        if step["step_index"] == 0:
+            assert extras is None
         if step["seq"] in steps:
             assert same(step, steps[step["seq"]])
             compared += 1
-        if extras and step["answered_seq"] in actions:
-            action = actions[step["answered_seq"]]
+        if extras and step["seq"] - 1 in actions:
+            action = actions[step["seq"] - 1]
             assert np.array_equal(extras["chosen_action"], action["action"])
             for name in ("log_probability", "policy_version"):
                 assert extras[name] == action[name]

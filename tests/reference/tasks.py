@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 
 from common.messages import TaskSpec
@@ -44,15 +46,46 @@ def make_minibatch(spec, rng, batch_size=16):
         return rng.integers(0, 256, shape, dtype=np.uint8) if spec.has_camera else None
 
     return Minibatch(
+        rows=2 * np.arange(batch_size),
         frames=frames(),
         proprioception=uniform(spec.proprioception_low, spec.proprioception_high),
         previous_action=uniform(spec.action_low, spec.action_high),
         action=uniform(spec.action_low, spec.action_high),
+        chosen_action=uniform(spec.action_low, spec.action_high),
+        log_probability=rng.normal(-1.4, 0.5, batch_size).astype(np.float32),
         reward=rng.uniform(-2.0, 0.0, batch_size).astype(np.float32),
         terminated=(rng.random(batch_size) < 0.3).astype(np.float32),
         next_frames=frames(),
         next_proprioception=uniform(spec.proprioception_low, spec.proprioception_high),
     )
+
+
+def make_rollout(spec, rng, length=40):
+    """Return a rollout: attempts of 1 to 7 transitions that end at the goal or without, the last one going on.
+
+    Where one transition follows another, its observation is the other's next one.
+    """
+    minibatch = make_minibatch(spec, rng, length)
+    arrays = {f.name: getattr(minibatch, f.name) for f in fields(minibatch)}
+    arrays["terminated"] = np.zeros(length, np.float32)
+    row = end = 0
+    for t in range(length):
+        if t == end:
+            end += int(rng.integers(1, 8))
+            row += 1  # the first of an attempt is no transition
+        else:
+            for name, before in (
+                ("proprioception", "next_proprioception"),
+                ("previous_action", "action"),
+                ("frames", "next_frames"),
+            ):
+                if arrays[name] is not None:
+                    arrays[name][t] = arrays[before][t - 1]
+        row += 1
+        arrays["rows"][t] = row
+        if t == end - 1:
+            arrays["terminated"][t] = rng.integers(2)
+    return Minibatch(**arrays)
 
 
 def make_observation(spec, rng):

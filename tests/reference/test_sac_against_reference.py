@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from common.algorithms.presets import SACConfig
 from common.algorithms.sac import SAC
+from common.algorithms.sac_config import SACConfig
 from tests.reference.plain_sac import PlainSAC
 from tests.reference.tasks import make_minibatch, make_spec
 

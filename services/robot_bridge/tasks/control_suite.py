@@ -156,7 +156,7 @@ class ControlSuiteTask(Task):
             task=name,
             preset=preset,
             pacing=pacing,
-            algorithm_presets={"sac": self.ALGORITHM_PRESET},
+            algorithm_presets={"sac": self.ALGORITHM_PRESET, "ppo": self.ALGORITHM_PRESET},
             action_low=self._world.model.actuator_ctrlrange[:, 0].astype(np.float32),
             action_high=self._world.model.actuator_ctrlrange[:, 1].astype(np.float32),
             proprioception_low=-limits,

@@ -103,7 +103,7 @@ class DotReacher(Task):
         """The part of the TaskSpec that says what is observed."""
         limits = np.array([POSITION_LIMIT, POSITION_LIMIT, MAX_SPEED, MAX_SPEED], np.float32)
         return {
-            "algorithm_presets": {"sac": "dot_reacher"},
+            "algorithm_presets": {"sac": "dot_reacher", "ppo": "dot_reacher"},
             "proprioception_low": -limits,
             "proprioception_high": limits,
             "frame_shape": np.zeros(3, np.int64),

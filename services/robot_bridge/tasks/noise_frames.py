@@ -52,7 +52,7 @@ class NoiseFrames(Task):
             task=name,
             preset=preset,
             pacing=pacing,
-            algorithm_presets={"sac": "noise_frames"},
+            algorithm_presets={"sac": "noise_frames", "ppo": "noise_frames"},
             action_low=np.full(2, -1, np.float32),
             action_high=np.full(2, 1, np.float32),
             proprioception_low=np.full(2, -1, np.float32),

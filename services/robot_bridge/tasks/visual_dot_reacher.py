@@ -56,7 +56,7 @@ class VisualDotReacher(DotReacher):
     def _observation_spec(self) -> dict[str, Any]:
         limits = np.full(2, MAX_SPEED, np.float32)
         return {
-            "algorithm_presets": {"sac": "visual_dot_reacher"},
+            "algorithm_presets": {"sac": "visual_dot_reacher", "ppo": "visual_dot_reacher"},
             "proprioception_low": -limits,
             "proprioception_high": limits,
             "frame_shape": np.array([FRAME_SIZE, FRAME_SIZE, 3], np.int64),

@@ -30,6 +30,16 @@ def test_steps_equal_the_plain_optimisers_for_gradients_of_other_strides():
     torch.testing.assert_close(fused, plain, rtol=0.0, atol=1e-12)
 
 
+def test_gradients_are_scaled_down_together_to_the_longest_allowed():
+    long, short = nn.Parameter(torch.tensor([3.0, 0.0])), nn.Parameter(torch.tensor([4.0]))
+    adam = Adam({"long": long, "short": short}, 1e-2, (0.9, 0.999), max_gradient_norm=1.0)
+    adam.minimise(0.5 * (long.square().sum() + short.square().sum()))  # the gradient is (3, 0; 4), of length 5
+    torch.testing.assert_close(long.grad, torch.tensor([0.6, 0.0]), rtol=0.0, atol=1e-5)
+    torch.testing.assert_close(short.grad, torch.tensor([0.8]), rtol=0.0, atol=1e-5)
+    adam.minimise(0.01 * long.sum() + 0.0 * short.sum())
+    torch.testing.assert_close(long.grad, torch.tensor([0.01, 0.01]))  # shorter ones are left alone
+
+
 def test_only_its_own_parameters_get_gradients():
     mine, other = nn.Parameter(torch.ones(2)), nn.Parameter(torch.ones(2))
     Adam({"mine": mine}, 1e-2, (0.9, 0.999)).minimise((mine * other).sum())

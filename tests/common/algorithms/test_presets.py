@@ -7,7 +7,9 @@ from dataclasses import asdict
 import pytest
 
 from common.algorithms import ALGORITHMS, load_algorithm
-from common.algorithms.presets import PRESETS, SAC_PRESETS, SACConfig, resolve_config
+from common.algorithms.ppo_config import PPO_PRESETS, PPOConfig
+from common.algorithms.presets import presets_of, resolve_config
+from common.algorithms.sac_config import SAC_PRESETS, SACConfig
 from common.errors import ConfigError
 
 # Columns: capacity, steps before the first update, updates per step, actor and critic lr, temperature lr,
@@ -53,8 +55,20 @@ def test_the_laptop_differs_from_the_workstation_in_what_it_can_hold():
     assert differing == {"batch_size": (64, 256), "replay_capacity": (16_000, 100_000)}
 
 
-def test_every_algorithm_has_presets():
-    assert set(ALGORITHMS) == set(PRESETS)
+def test_the_defaults_of_ppo_are_the_published_ones():
+    config = PPOConfig()
+    assert (config.rollout_length, config.batch_size, config.epochs) == (4096, 256, 10)
+    assert (config.actor_lr, config.critic_lr, config.discount, config.gae_lambda) == (3e-4, 1e-3, 0.99, 0.97)
+    assert (config.clip, config.adam_betas) == (0.2, (0.9, 0.999))
+    assert (config.hidden_size, config.encoder_strides) == (1024, (2, 2, 2, 1))
+    ur5 = PPO_PRESETS["ur5"]
+    assert {**asdict(ur5), "replay_capacity": None} == {**asdict(config), "replay_capacity": None}
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_algorithm_has_presets_for_the_tasks_of_this_repository(name):
+    wanted = {"dot_reacher", "visual_dot_reacher", "noise_frames", "dm_reacher", "dm_ball_in_cup"}
+    assert wanted <= set(presets_of(name))
 
 
 def test_overrides_replace_settings_and_convert_lists_and_integers():
@@ -93,6 +107,33 @@ def test_overrides_replace_settings_and_convert_lists_and_integers():
 def test_a_bad_value_is_refused_naming_key_value_and_what_was_expected(name, value):
     with pytest.raises(ConfigError, match=rf"{name}.* = .*: expected"):
         resolve_config("sac", "create", {name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("rollout_length", 0),
+        ("epochs", 0),
+        ("clip", 0.0),
+        ("gae_lambda", 1.1),
+        ("entropy_coefficient", -0.1),
+        ("max_gradient_norm", 0.0),
+        ("replay_capacity", 4000),  # less than two rollouts of 2048
+        ("policy_push_interval", 2),
+        ("random_crop", True),
+        ("discount", -0.1),
+    ],
+)
+def test_a_bad_value_for_ppo_is_refused_too(name, value):
+    with pytest.raises(ConfigError, match=rf"{name}.* = .*: expected"):
+        resolve_config("ppo", "dot_reacher", {name: value})
+
+
+def test_what_belongs_to_one_algorithm_is_unknown_to_another():
+    with pytest.raises(ConfigError, match=r"ppo: unknown setting 'replay_ratio'; known: .*rollout_length"):
+        resolve_config("ppo", "dot_reacher", {"replay_ratio": 1.0})
+    with pytest.raises(ConfigError, match=r"sac: unknown setting 'rollout_length'; known: .*replay_ratio"):
+        resolve_config("sac", "dot_reacher", {"rollout_length": 100})
 
 
 def test_unknown_names_are_refused_naming_the_known_ones():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from common.algorithms.presets import SACConfig
 from common.algorithms.sac import SAC
+from common.algorithms.sac_config import SACConfig
 from common.errors import ConfigError
 from common.minibatch import Minibatch
 from common.policies import initial_policy, policy_from_weights
@@ -117,10 +117,13 @@ def test_networks_learn_the_value_of_a_two_step_task():
     sac = SAC(SPEC, replace(config, actor_lr=0.0), seed=0, precision="float32", noise=torch.zeros)
     centre = np.tile((SPEC.action_low + SPEC.action_high) / 2, (8, 1))
     minibatch = Minibatch(
+        rows=np.arange(8),
         frames=None,
         proprioception=np.stack([far, near] * 4),
         previous_action=centre,
         action=centre,
+        chosen_action=centre,
+        log_probability=np.zeros(8, np.float32),
         reward=-np.ones(8, np.float32),
         terminated=np.array([0.0, 1.0] * 4, np.float32),
         next_frames=None,

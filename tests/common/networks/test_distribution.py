@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from common.networks.distribution import TanhGaussian
+from common.networks.distribution import LARGEST_ACTION, TanhGaussian
 
 
 def distribution(mean, log_std):
@@ -29,6 +29,24 @@ def test_log_densities_of_action_dimensions_add_up():
     first = distribution([0.1], [0.2]).act(noise[:, :1])[1]
     second = distribution([-0.4], [-0.3]).act(noise[:, 1:])[1]
     torch.testing.assert_close(both, first + second)
+
+
+def test_an_action_has_the_density_that_acting_gave_it():
+    generator = torch.Generator().manual_seed(0)
+    mean, log_std, noise = (torch.randn(50, 3, generator=generator, dtype=torch.float64) for _ in range(3))
+    policy = TanhGaussian(mean, log_std)
+    action, log_probability = policy.act(noise)
+    near = (action.abs() < LARGEST_ACTION).all(dim=1)
+    assert near.sum() > 30
+    torch.testing.assert_close(policy.log_probability(action)[near], log_probability[near], rtol=0.0, atol=1e-8)
+
+
+def test_an_action_on_its_bound_has_a_finite_density_and_gradient():
+    mean = torch.zeros(1, 2, requires_grad=True)
+    log_probability = TanhGaussian(mean, torch.zeros(1, 2)).log_probability(torch.tensor([[1.0, -1.0]]))
+    (gradient,) = torch.autograd.grad(log_probability.sum(), mean)
+    assert torch.isfinite(log_probability).all()
+    assert torch.isfinite(gradient).all()
 
 
 @pytest.mark.parametrize(("mean", "log_std"), [(0.0, 0.0), (0.7, -1.0), (-1.5, 0.5)])

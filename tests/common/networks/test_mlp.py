@@ -1,4 +1,4 @@
-"""Actor and twin critics."""
+"""Actor, state value and twin critics."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from common.networks.mlp import Actor, TwinQ
+from common.networks.mlp import Actor, StateValue, TwinQ
 
 
 def make_critics(wide=torch.float32):
@@ -41,6 +41,15 @@ def test_the_actor_returns_mean_and_log_std_of_its_last_layer():
     mean, log_std = actor(torch.randn(2, 4))
     assert mean.tolist() == [[0.0, 1.0, 2.0]] * 2
     assert log_std.tolist() == [[3.0, 4.0, 5.0]] * 2
+
+
+def test_the_state_value_is_one_number_for_each_observation():
+    value = StateValue(4, 32, np.random.default_rng(0), dtype=torch.float32, wide=torch.float32)
+    x = vector = torch.randn(5, 4)
+    for i, layer in enumerate(value):
+        x = functional.linear(x if i == 0 else x.relu(), layer.weight, layer.bias)
+    torch.testing.assert_close(value(vector), x[:, 0])
+    assert 0.9 * 32**-0.5 < value[1].weight.abs().max() <= 32**-0.5
 
 
 def test_a_bfloat16_hidden_layer_changes_values_little_and_gradients_stay_float32():

@@ -11,11 +11,13 @@ sys.modules["torch"] = None  # any import of torch now raises ImportError
 
 import numpy as np
 from common.algorithms import ALGORITHMS
-from common.algorithms.presets import SAC_PRESETS, resolve_config
+from common.algorithms.presets import presets_of, resolve_config
 from common.policies import initial_policy, pack_weights, policy_from_weights
 from common.policies.weights import initial_parameters
 from tests.reference.tasks import make_observation, make_spec
 
+for name in ALGORITHMS:
+    assert "dot_reacher" in presets_of(name)
 config = resolve_config("sac", "dot_reacher", {"batch_size": 32})
 spec, rng = make_spec(), np.random.default_rng(0)
 observation = make_observation(spec, rng)

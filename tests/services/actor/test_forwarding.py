@@ -1,4 +1,4 @@
-"""TimeSteps become experience: in order, each once, with what the policy knew of the applied action."""
+"""TimeSteps become experience: in order, each once, with what the policy chose on the one before."""
 
 import threading
 
@@ -77,22 +77,29 @@ def test_experience_is_numbered_and_holds_the_time_step_unchanged(line):
             np.testing.assert_array_equal(getattr(got.time_step, name), value)
 
 
-def test_the_extras_are_those_of_the_answer_that_was_applied(line):
+def test_the_extras_are_those_of_the_answer_to_the_time_step_before_whichever_was_applied(line):
     line.forwarder.remember_answer(step(0), extras(10))
     line.forwarder.remember_answer(step(1), extras(11))
     line.forwarder.remember_answer(step(2), extras(12))
-    # Number 2 was answered too late: the answer to number 1 was held through two cycles.
+    # Number 2 was answered too late: the answer to number 1 was held through two cycles. Number 3 was not answered.
     line.add(0, 1, 2, step(3, answered_seq=1), 4)
     experiences = line.experiences.wait_for(5)
-    assert [e.extras and e.extras.policy_version for e in experiences] == [None, 10, 11, 11, None]
+    assert [e.extras and e.extras.policy_version for e in experiences] == [None, 10, 11, 12, None]
     np.testing.assert_array_equal(experiences[1].extras.chosen_action, [10, 10])
     assert experiences[1].extras.log_probability == -10.0
 
 
-def test_where_the_action_was_no_actors_there_are_no_extras(line):
+def test_the_first_time_step_of_an_attempt_has_no_extras(line):
+    # The answer to number 0 came after the attempt that it belongs to had been given up.
+    line.forwarder.remember_answer(step(0), extras(10))
+    line.add(0, step(1, step_index=0, answered_seq=-1))
+    assert line.experiences.wait_for(2)[1].extras is None
+
+
+def test_an_answer_that_was_never_applied_is_experience_too(line):
     line.forwarder.remember_answer(step(0), extras(10))
     line.add(0, step(1, answered_seq=-1))
-    assert line.experiences.wait_for(2)[1].extras is None
+    assert line.experiences.wait_for(2)[1].extras.policy_version == 10
 
 
 def test_the_extras_of_another_bridges_time_step_are_not_taken(line):

@@ -6,8 +6,8 @@ import threading
 import numpy as np
 import pytest
 
-from common.algorithms.presets import SACConfig
 from common.algorithms.sac import SAC
+from common.algorithms.sac_config import SACConfig
 from common.errors import ConfigError
 from services.learner import checkpoint as checkpoints
 from services.learner.checkpoint import CHECKPOINT_FILE, POLICY_FILE, CheckpointWriter, restore

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from common import topics
+from common.algorithms import load_algorithm
+from common.algorithms.base import Algorithm
 from common.algorithms.presets import resolve_config
-from common.algorithms.sac import SAC
 from common.frame_ring import RING_FILE, RingReader
 from common.messages import ActionSource
 from common.policies import initial_policy
@@ -34,22 +35,28 @@ from services.robot_bridge.tasks.noise_frames import read_frame_id
 from tests.services.builders import MemoryRecord, Messages
 
 END_TIMEOUT_S = 120.0
-SMALL = {"hidden_size": 32, "batch_size": 8, "min_size_to_sample": 20, "policy_push_interval": 5}
+SMALL = {
+    "sac": {"hidden_size": 32, "batch_size": 8, "min_size_to_sample": 20, "policy_push_interval": 5},
+    "ppo": {"hidden_size": 32, "batch_size": 16, "rollout_length": 50, "epochs": 2, "replay_capacity": 2000},
+}
 # Frames so small that the crop has no margin: every frame of a minibatch still carries its id.
 TINY_FRAMES = {"height": 9, "width": 9, "frames_per_cycle": 1.2, "time_limit": 25, "reset_steps": 3}
 TINY_ENCODER = {"encoder_strides": [1, 1, 1, 1]}
 
 
-class KeepingSAC(SAC):
-    """Keeps the minibatches that it learns from."""
+def keeping(algorithm_class):
+    """The algorithm, keeping the minibatches that it learns from."""
 
-    def __init__(self, *arguments, **keywords) -> None:
-        super().__init__(*arguments, **keywords)
-        self.minibatches = []
+    class Keeping(algorithm_class):
+        def __init__(self, *arguments, **keywords) -> None:
+            super().__init__(*arguments, **keywords)
+            self.minibatches = []
 
-    def update(self, minibatch) -> None:
-        self.minibatches.append(minibatch)
-        super().update(minibatch)
+        def update(self, minibatch) -> None:
+            self.minibatches.append(minibatch)
+            super().update(minibatch)
+
+    return Keeping
 
 
 @dataclass
@@ -60,7 +67,7 @@ class Ring:
     actor: Actor
     replay: Replay
     learner: Learner
-    algorithm: KeepingSAC
+    algorithm: Algorithm
     time_steps: list
     reader: RingReader
 
@@ -82,6 +89,7 @@ def run_ring(
     steps,
     *,
     task=None,
+    name="sac",
     algorithm=None,
     access="map",
     frames="host",
@@ -96,8 +104,8 @@ def run_ring(
     time_steps = Messages(network.transport(run), topics.TIME_STEP)
     world = load_task(task_name, "", task or {}, pacing=pacing, rng=np.random.default_rng(0))
     spec = world.spec
-    config = resolve_config("sac", spec.algorithm_presets["sac"], {**SMALL, **(algorithm or {})})
-    sac = KeepingSAC(spec, config, seed=0, precision="float32")
+    config = resolve_config(name, spec.algorithm_presets[name], {**SMALL[name], **(algorithm or {})})
+    learnt = keeping(load_algorithm(name))(spec, config, seed=0, precision="float32")
     policy = initial_policy(spec, config.hidden_size, config.encoder_strides, 0)
     source = MappedMinibatches if access == "map" else ReceivedMinibatches
     open_ring = partial(DeviceRingReader, device=torch.device("cpu")) if frames == "device" else RingReader
@@ -109,7 +117,12 @@ def run_ring(
         topics.ACTOR: partial(Actor, spec=spec, initial=policy, settings=ActorSettings()),
         topics.REPLAY: partial(Replay, spec=spec, algorithm=config, settings=ReplaySettings(access=access)),
         topics.LEARNER: lambda service: Learner(
-            service, sac, config, LearnerSettings(), source(service, spec, 2, *extra), policy_version=0
+            service,
+            learnt,
+            config,
+            LearnerSettings(),
+            source(service, spec, 2, *extra, random_crop=config.random_crop),
+            policy_version=0,
         ),
     }
     made = {}
@@ -138,7 +151,7 @@ def run_ring(
     once = {time_step.seq: time_step for time_step in time_steps}
     return Ring(
         *(made[name] for name in topics.SERVICES),
-        sac,
+        learnt,
         [once[seq] for seq in sorted(once)],
         RingReader(directory / RING_FILE),
     )
@@ -258,6 +271,44 @@ def test_in_lockstep_every_cycle_has_the_policys_own_action_with_its_extras(tmp_
     assert all(t.action_source is ActionSource.POLICY and t.answered_seq == t.seq - 1 for t in acted)
     counters = ring.bridge.counters()
     assert (counters["late_actions"], counters["unanswered"], counters["overruns"]) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("access", ["map", "arrays"])
+@pytest.mark.parametrize("task_name", ["dot_reacher", "noise_frames"])
+def test_ppo_learns_from_each_policys_own_steps_in_order_and_once(tmp_path, task_name, access):
+    camera = task_name == "noise_frames"
+    ring = run_ring(
+        tmp_path,
+        task_name,
+        steps=330,
+        task=TINY_FRAMES if camera else None,
+        name="ppo",
+        algorithm=TINY_ENCODER if camera else None,
+        access=access,
+    )
+    assert_nothing_lost_nothing_twice(ring)
+    rollouts, counters = ring.algorithm.minibatches, ring.replay.counters()
+    assert len(rollouts) == ring.algorithm.updates == counters["rollouts"] >= 4
+    learnt_rows = np.concatenate([rollout.rows for rollout in rollouts])
+    assert (np.diff(learnt_rows) > 0).all()
+    for version, rollout in enumerate(rollouts):
+        records = ring.reader.read_rows(rollout.rows)
+        assert records["pair"].all()
+        assert set(records["policy_version"]) == {version}  # a push for each rollout, none overtaken
+        np.testing.assert_array_equal(rollout.chosen_action, records["chosen_action"])
+        np.testing.assert_array_equal(rollout.log_probability, records["log_probability"])
+        np.testing.assert_array_equal(rollout.next_proprioception, records["proprioception"])
+        # Where rows follow each other, so do the observations.
+        follows = np.flatnonzero(np.diff(rollout.rows) == 1)
+        np.testing.assert_array_equal(rollout.proprioception[follows + 1], rollout.next_proprioception[follows])
+        if camera:
+            np.testing.assert_array_equal(rollout.frames[follows + 1], rollout.next_frames[follows])
+    # Every transition was learnt from, waits for its rollout to fill, or was dropped and counted.
+    transitions = counters["transitions"]
+    waiting = counters["rollout_transitions"] if counters["rollout_transitions"] < 50 else 0
+    assert transitions == len(learnt_rows) + waiting + counters["dropped_transitions"]
+    # In lockstep the actor waits for the policy: what it had begun when the rollout was complete is all that is lost.
+    assert counters["dropped_transitions"] <= 3 * len(rollouts)
 
 
 @pytest.mark.parametrize("order", [topics.SERVICES[::-1], ("replay", "robot_bridge", "learner", "actor")], ids=" ".join)

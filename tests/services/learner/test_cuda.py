@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from common.algorithms.presets import SACConfig
 from common.algorithms.sac import SAC
+from common.algorithms.sac_config import SACConfig
 from common.frame_ring import RingReader, crop_shape, draw_crop_offset, drop_overtaken
 from common.policies import policy_from_weights
 from services.learner import device_frames

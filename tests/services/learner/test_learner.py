@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from common import topics
-from common.algorithms.presets import SACConfig
 from common.algorithms.sac import SAC
+from common.algorithms.sac_config import SACConfig
 from common.clock import FakeClock
 from common.codec import decode
 from common.messages import Finished, PolicyWeights

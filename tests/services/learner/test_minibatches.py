@@ -1,6 +1,6 @@
 """Minibatches come by credit, in order, once; from the mapped ring or as arrays."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 
 import numpy as np
@@ -11,6 +11,7 @@ from common import topics
 from common.clock import FakeClock
 from common.frame_ring import RING_FILE, RingReader, RingWriter, array_minibatch
 from common.messages import RowMinibatch
+from common.minibatch import Minibatch
 from common.transport import InMemoryNetwork
 from services.learner.device_frames import DeviceRingReader
 from services.learner.minibatches import MappedMinibatches, ReceivedMinibatches
@@ -22,12 +23,13 @@ LEARNER = 77
 PREFETCH = 3
 SHAPE = (HEIGHT - 2 * MARGIN_Y, WIDTH - 2 * MARGIN_X, STACK * 3)
 CAPACITY = 40
+FIELDS = [field.name for field in fields(Minibatch) if field.name not in ("frames", "next_frames")]
 
 
 class Scene:
     """A source of minibatches, and the replay that serves it, with a ring of its own."""
 
-    def __init__(self, directory, source_class, open_ring=RingReader) -> None:
+    def __init__(self, directory, source_class, open_ring=RingReader, **options) -> None:
         self.clock = FakeClock()
         self.network = InMemoryNetwork()
         self.service = SoloService(topics.LEARNER, self.network, directory, self.clock, incarnation=LEARNER)
@@ -35,7 +37,7 @@ class Scene:
         self.peer = Peer(self.network)
         self.credits = self.peer.messages(topics.CREDIT)
         extra = [self.path, open_ring] if source_class is MappedMinibatches else []
-        self.source = source_class(self.service, task_spec(), PREFETCH, *extra)
+        self.source = source_class(self.service, task_spec(), PREFETCH, *extra, **options)
         self.ring = None
 
     def fill(self, count) -> None:
@@ -64,8 +66,8 @@ class Scene:
         )
 
 
-def started(directory, source_class, *open_ring):
-    scene = Scene(directory, source_class, *open_ring)
+def started(directory, source_class, *open_ring, **options):
+    scene = Scene(directory, source_class, *open_ring, **options)
     scene.source.start()
     yield scene
     scene.source.stop()
@@ -144,10 +146,25 @@ def test_a_minibatch_is_what_its_rows_hold_cropped_at_random(mapped):
         # One offset for all of a minibatch, o and o' alike.
         next_frames = whole.next_frames[:, y : y + SHAPE[0], x : x + SHAPE[1]]
         np.testing.assert_array_equal(minibatch.next_frames, next_frames)
-        for name in ("proprioception", "previous_action", "action", "reward", "terminated", "next_proprioception"):
+        for name in FIELDS:
             np.testing.assert_array_equal(getattr(minibatch, name), getattr(whole, name))
         offsets.add(offset)
     assert len(offsets) > 1
+
+
+@pytest.mark.parametrize("source_class", [MappedMinibatches, ReceivedMinibatches])
+def test_an_algorithm_may_ask_for_the_crop_that_acting_sees(source_class, tmp_path):
+    for scene in started(tmp_path, source_class, random_crop=False):
+        scene.fill(30)
+        rows = np.array([2, 9, 29])
+        for ordinal in range(3):
+            if source_class is MappedMinibatches:
+                scene.send_rows(ordinal, rows)
+            else:
+                scene.send_arrays(ordinal, rows)
+            whole = RingReader(scene.path).gather(rows).minibatch
+            middle = whole.frames[:, MARGIN_Y : MARGIN_Y + SHAPE[0], MARGIN_X : MARGIN_X + SHAPE[1]]
+            np.testing.assert_array_equal(scene.get().frames, middle)
 
 
 def test_a_minibatch_comes_once_and_in_order(mapped):
@@ -225,7 +242,7 @@ def test_arrays_make_the_same_minibatch_as_the_ring(received, max_bytes):
         for x in range(2 * MARGIN_X + 1)
     ]
     assert sum(np.array_equal(minibatch.frames, crop) for crop in crops) == 1
-    for name in ("proprioception", "previous_action", "action", "reward", "terminated", "next_proprioception"):
+    for name in FIELDS:
         np.testing.assert_array_equal(getattr(minibatch, name), getattr(whole, name))
 
 

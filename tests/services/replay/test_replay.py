@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common import topics
-from common.algorithms.presets import SACConfig
+from common.algorithms.sac_config import SACConfig
 from common.clock import FakeClock
 from common.errors import RingError
 from common.frame_encoding import FrameEncoding, encode_frames
