@@ -119,8 +119,11 @@ class Actor:
         time_step = arrived.message
         if self._spec.pacing == "lockstep":
             self._wait_for_updates()
-        policy = self._swap.policy
+        policy, clock = self._swap.policy, self._service.clock
+        began_ns = clock.now_ns()
         chosen = policy.act(observation, self._rng)
+        sent_ns = clock.now_ns()
+        offset_ns, offset_bound_ns = self._service.bridge_offset(sent_ns)
         self._last_answer = encode(
             Action(
                 actor_incarnation=self._service.incarnation,
@@ -130,7 +133,10 @@ class Actor:
                 log_probability=chosen.log_probability,
                 policy_version=policy.version,
                 received_ns=arrived.at_ns,
-                sent_ns=self._service.clock.now_ns(),
+                began_ns=began_ns,
+                sent_ns=sent_ns,
+                offset_ns=offset_ns,
+                offset_bound_ns=offset_bound_ns,
             )
         )
         self._action_publisher.put(self._last_answer)

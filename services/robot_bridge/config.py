@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from common.config import setting
-from common.run_settings import JournalSettings, RunSettings, TransportSettings
+from common.run_settings import ClockSettings, JournalSettings, RunSettings, TransportSettings
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,7 @@ class RobotBridgeConfig:
 
     run: RunSettings
     transport: TransportSettings
+    clock: ClockSettings
     task: TaskSettings
     tasks: TaskTable
     robot_bridge: RobotBridgeSettings

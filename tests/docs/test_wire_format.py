@@ -25,6 +25,7 @@ from common.messages import (
     Array,
     ArrayMinibatch,
     Bounds,
+    ClockReading,
     Command,
     CommandReply,
     Credit,
@@ -96,8 +97,9 @@ def make_array_minibatch() -> ArrayMinibatch:
 
 EXAMPLES = (
     SPEC,
+    ClockReading(5, 6, 7),
     make_time_step(3),
-    Action(5, 6, 7, np.array([0.5, -1], np.float32), -1.25, 3, 8, 9),
+    Action(5, 6, 7, np.array([0.5, -1], np.float32), -1.25, 3, 8, 9, 10, -11, 12),
     make_experience(0),
     make_experience(3),
     Acknowledgement(5, 6, np.array([[6, 8], [10, 11]]), 2.5),
@@ -334,13 +336,16 @@ EXAMPLE = Action(
     log_probability=-1.25,
     policy_version=3,
     received_ns=5_000_000,
+    began_ns=5_100_000,
     sent_ns=5_400_000,
+    offset_ns=-3_000_000,
+    offset_bound_ns=200_000,
 )
 
 
 def test_the_example_is_the_payload_of_what_it_says():
     payload = b"".join(part for part, _ in example_lines())
-    assert len(payload) == 181
+    assert len(payload) == 231
     assert payload == encode(EXAMPLE)
     assert_same(program("client.py").decode(payload, "Action"), as_fields(EXAMPLE))
 
@@ -379,12 +384,12 @@ def test_a_service_reads_what_the_client_writes(message):
 
 def test_the_client_refuses_another_message_schema_and_dtype():
     client = program("client.py")
-    with pytest.raises(ValueError, match="expected Action of schema 1, got Command of schema 1"):
+    with pytest.raises(ValueError, match="expected Action of schema 2, got Command of schema 2"):
         client.decode(encode(Command("stop")), "Action")
-    with pytest.raises(ValueError, match="got Command of schema 2"):
-        client.decode(msgpack.packb({"schema": 2, "message": "Command", "name": "stop"}))
+    with pytest.raises(ValueError, match="got Command of schema 1"):
+        client.decode(msgpack.packb({"schema": 1, "message": "Command", "name": "stop"}))
     with pytest.raises(ValueError, match="expected a dtype"):
-        client.decode(msgpack.packb({"schema": 1, "message": "X", "x": ["|O", [1], b"12345678"]}))
+        client.decode(msgpack.packb({"schema": 2, "message": "X", "x": ["|O", [1], b"12345678"]}))
 
 
 def test_the_tables_refuse_what_is_not_as_they_say():
