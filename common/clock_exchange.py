@@ -19,8 +19,8 @@ from common.inbox import Refusals
 from common.messages import ClockReading
 from common.transport import Transport
 
-EXCHANGE_S = 0.1
-"""Pause between two questions for the bridge's time."""
+EXCHANGE_S = {topics.ACTOR: 0.1, topics.REPLAY: 1.0, topics.LEARNER: 1.0}
+"""Pause between two questions for the bridge's time; the actor's offset splits the age of each action."""
 EXCHANGE_TIMEOUT_S = 0.5
 """An answer that takes longer tells nothing worth waiting for."""
 UNKNOWN = 0, -1
@@ -42,7 +42,8 @@ def serve_clock(transport: Transport, clock: Clock, incarnation: int) -> None:
 class OffsetTracker:
     """Knows what the bridge's clock shows, and how wrong that can be."""
 
-    def __init__(self, transport: Transport, clock: Clock, refusals: Refusals) -> None:
+    def __init__(self, service: str, transport: Transport, clock: Clock, refusals: Refusals) -> None:
+        self._pause_s = EXCHANGE_S[service]
         self._transport, self._clock, self._refusals = transport, clock, refusals
         self._estimator = OffsetEstimator()
         self._estimate: OffsetEstimate | None = None
@@ -93,7 +94,7 @@ class OffsetTracker:
                 self._unanswered += 1
             with self._wake:
                 if not self._stopping:
-                    self._clock.wait(self._wake, EXCHANGE_S)
+                    self._clock.wait(self._wake, self._pause_s)
 
     def _exchange(self) -> None:
         asked_ns = self._clock.now_ns()

@@ -91,7 +91,7 @@ class Service:
         if name == topics.ROBOT_BRIDGE:
             serve_clock(transport, self.clock, self.incarnation)
         else:
-            self._offset = OffsetTracker(transport, self.clock, self.refusals)
+            self._offset = OffsetTracker(name, transport, self.clock, self.refusals)
         self._heart_wake = self.clock.condition()
         self._heart = self.clock.thread(self._beat, f"{name} heartbeat")
         self._heart_stop = False

@@ -20,7 +20,7 @@ QUANTILES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "max": 100.0}
 WAYS = ("uplink", "downlink")
 """Parts that need the offset between two clocks."""
 TOLERANCE_MS = 0.1
-"""By this much more than its stated error a way may seem shorter than nothing: each time is rounded, and late by a bit."""
+"""A way may seem shorter than nothing by its stated error and this: each time is rounded, and read a bit late."""
 
 Floats = npt.NDArray[np.float64]
 

@@ -60,8 +60,8 @@ def table(run: RunLatency) -> str:
         lines.append(f"  {part:<12}" + "".join(cells))
     p50, largest = np.percentile(ages.offset_bound, [50, 100])
     lines.append(
-        f"  {' and '.join(WAYS)} may be off by {p50:.3f} ms (p50; at most {largest:.3f} ms), one too long and the other "
-        "too short: the error bound of the clocks' offset"
+        f"  {' and '.join(WAYS)} may be off by {p50:.3f} ms (p50; at most {largest:.3f} ms), one too long and the "
+        "other too short: the error bound of the clocks' offset"
     )
     lines.append(f"  {len(ages.age)} applied actions{_left_out(ages)}")
     return "\n".join(lines)

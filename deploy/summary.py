@@ -13,11 +13,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from common.errors import ConfigError, RelodError, RingError
 from common.messages import Int64Array
 from common.record import settle_parts, write_atomically
 from common.topics import ACTOR, LEARNER, ROBOT_BRIDGE
 from deploy import parts as run_parts
+from deploy.action_age import ActionAges
 from deploy.actions import ArrivedActions, last_published_ns, outage_ends
 from deploy.curve import draw_learning_curve
 from deploy.episodes import Episode, EpisodeTable, steps_per_goal
@@ -46,6 +49,7 @@ class Record:
     run: RunFile | None
     episodes: list[Episode]
     actions: ArrivedActions | None
+    ages: ActionAges | None
     ring: RingContent | None
     network: NetworkPart | None
     warnings: list[str] = field(default_factory=list)
@@ -93,6 +97,7 @@ def read_record(run_dir: Path) -> Record:
         run=attempt(lambda: RunFile.read(run_dir)),
         episodes=table.episodes,
         actions=actions,
+        ages=_read_ages(run_dir),
         ring=attempt(lambda: read_ring(run_dir / "ring")),
         network=attempt(lambda: _read_network(run_dir)),
         warnings=warnings,
@@ -105,8 +110,6 @@ def read_ring(path: Path) -> RingContent:
     Raises:
         RingError: there is none, or it cannot be read.
     """
-    import numpy as np
-
     from common.frame_ring import RingReader
 
     if not path.exists():
@@ -161,6 +164,7 @@ def summarise(record: Record) -> Summary:
         "policy_pushes": _count(parts.total(LEARNER, "policy_pushes")),
         "policy_version": _count(parts.greatest(LEARNER, "policy_version")),
         "observation_to_action_ms": _observation_to_action_ms(record),
+        "action_age_ms": _action_age_ms(record),
         "outages": _outages(record, notes),
         "bytes_per_key": bytes_per_key(parts.bytes_sent()),
         "wall_s": run_parts.elapsed_s(parts),
@@ -206,6 +210,13 @@ def _observation_to_action_ms(record: Record) -> dict[str, float] | None:
     return record.actions.observation_to_action_ms()
 
 
+def _action_age_ms(record: Record) -> dict[str, float] | None:
+    if record.ages is None or (record.run is not None and record.run.mode == IN_PROCESS):
+        return None
+    medians = {name: values["p50"] for name, values in record.ages.quantiles_ms().items()}
+    return {**medians, "offset_bound": round(float(np.median(record.ages.offset_bound)), 3)}
+
+
 def _outages(record: Record, notes: list[str]) -> list[dict[str, float | None]] | None:
     if record.network is None or record.actions is None:
         # Without a network there are none; with one whose actions are unknown, nobody can say.
@@ -222,6 +233,13 @@ def _network_link(record: Record) -> dict[str, Any] | None:
         return None
     parts, run = record.parts, record.run
     return network_link(run.backend, record.network, parts.bytes_sent(), parts.bytes_received(), run.placement)
+
+
+def _read_ages(run_dir: Path) -> ActionAges | None:
+    try:
+        return ActionAges.read(run_dir)
+    except ConfigError:
+        return None  # `python -m deploy.latency` says why; a run in which nothing was applied misses nothing
 
 
 def _read_network(run_dir: Path) -> NetworkPart | None:

@@ -1,4 +1,4 @@
-"""The offset between two clocks, over links whose delays are known: found, followed, and never further off than said."""
+"""The offset between two clocks over links of known delays: found, followed, and never further off than said."""
 
 from __future__ import annotations
 

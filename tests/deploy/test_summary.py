@@ -14,7 +14,7 @@ from deploy.run_file import RunFile
 from deploy.summary import read_record, summarise
 from deploy.summary_text import summary_text
 from tests.common.ring_cases import Bridge, task_spec
-from tests.deploy.hand_made_record import network_part, write_actions, write_episodes, write_part
+from tests.deploy.hand_made_record import network_part, write_actions, write_ages, write_episodes, write_part
 
 FIELDS = [
     "task",
@@ -35,6 +35,7 @@ FIELDS = [
     "policy_pushes",
     "policy_version",
     "observation_to_action_ms",
+    "action_age_ms",
     "outages",
     "bytes_per_key",
     "wall_s",
@@ -166,6 +167,24 @@ def test_the_summary_of_a_run_with_several_incarnations(tmp_path: Path) -> None:
         ("learner", 150),
     ]
     assert values["service_failures"][-1]["failure"] == "out of memory"
+
+
+def test_the_medians_of_an_action_s_age_are_told_with_the_clocks_error(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    write_ages(tmp_path, [(1, 2, 3, 4, 5, 6, 7, 0.5), (1, 2, 13, 4, 5, 6, 7, 0.7), (1, 2, 4, 4, 5, 6, 7, 0.6)])
+    values = summarise(read_record(tmp_path)).values
+    assert values["action_age_ms"] == {
+        **{"camera": 1, "encode": 2, "uplink": 4, "queue": 4, "inference": 5, "downlink": 6, "apply": 7},
+        **{"age": 29, "offset_bound": 0.6},
+    }
+    assert "29.00 ms of age (p50): camera 1.00, encode 2.00, uplink 4.00" in summary_text(values)
+
+
+def test_in_simulated_time_an_action_has_no_age(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    replace(RUN, mode="in_process").write(tmp_path)
+    write_ages(tmp_path, [(1, 2, 3, 4, 5, 6, 7, 0.5)])
+    assert summarise(read_record(tmp_path)).values["action_age_ms"] is None
 
 
 def test_rows_that_stand_twice_in_the_ring_are_counted(tmp_path: Path) -> None:
