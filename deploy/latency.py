@@ -28,8 +28,9 @@ class RunLatency:
     """One run: what it was, and its actions' ages."""
 
     run_dir: Path
-    name: str
-    """Mode and network, as far as the record knows."""
+    mode: str
+    """Mode and network; empty where the record does not know them."""
+    task: str
     ages: ActionAges
 
     @classmethod
@@ -45,15 +46,16 @@ class RunLatency:
         try:
             run = RunFile.read(run_dir)
         except ConfigError:  # of a run that was put together by hand
-            return cls(run_dir, run_dir.name, ages)
-        return cls(run_dir, f"{run.mode}, {run.task}, network {Path(run.network).stem}", ages)
+            return cls(run_dir, "", "", ages)
+        return cls(run_dir, f"{run.mode}, network {Path(run.network).stem}", run.task, ages)
 
 
 def table(run: RunLatency) -> str:
     """One run's parts as text."""
     ages = run.ages
     quantiles = ages.quantiles_ms()
-    lines = [f"{run.run_dir}: {run.name}", f"  {'ms':<12}" + "".join(f"{name:>10}" for name in QUANTILES)]
+    facts = ", ".join(filter(None, (run.mode, run.task)))
+    lines = [f"{run.run_dir}{facts and f': {facts}'}", f"  {'ms':<12}" + "".join(f"{name:>10}" for name in QUANTILES)]
     for part in (*PARTS, AGE):
         values = quantiles.get(part)
         cells = (f"{values[name]:>10.3f}" if values else f"{'-':>10}" for name in QUANTILES)
@@ -86,7 +88,7 @@ def draw(runs: Sequence[RunLatency], path: Path) -> None:
         age = quantiles.pop(AGE)
         bars.append(
             RunBars(
-                label=f"{run.run_dir.name}\n{run.name}",
+                label="\n".join(filter(None, (run.run_dir.resolve().name, run.mode))),
                 parts={part: {name: values[name] for name in DRAWN} for part, values in quantiles.items()},
                 age={name: age[name] for name in DRAWN},
                 offset_bound=float(np.percentile(run.ages.offset_bound, 50)),

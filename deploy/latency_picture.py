@@ -97,7 +97,8 @@ def _draw_spreads(axes: Axes, runs: Sequence[RunBars]) -> None:
                 axes.text(values["p99"], y, f" {values['p50']:.2f} – {values['p99']:.2f}", va="center", fontsize=8)
     axes.set_yticks(range(len(shown)), [_LABELS.get(part, part) for part in shown])
     axes.set_ylim(len(shown) - 0.5, -0.5)
-    axes.margins(x=0.12)
+    longest = max(values["p99"] for run in runs for values in run.parts.values())
+    axes.set_xlim(0.0, 1.2 * longest)  # room for the numbers
     axes.set_xlabel("ms: bar p50, tick p90, end of the line p99")
     axes.grid(axis="x", alpha=0.3)
     axes.set_axisbelow(True)

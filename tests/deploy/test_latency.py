@@ -63,7 +63,7 @@ def test_runs_stand_side_by_side_with_their_names_and_the_clocks_error(tmp_path,
     picture = tmp_path / "both.png"
     assert latency.main([str(near), str(far), "--picture", str(picture)]) == 0
     said = capsys.readouterr().out
-    assert f"{far}: remote_only, dot_reacher, network outage" in said
+    assert f"{far}: remote_only, network outage, dot_reacher" in said
     assert "uplink          25.000    25.000    25.000    25.000" in said
     assert "age             69.000" in said
     assert "uplink and downlink may be off by 2.500 ms (p50; at most 2.500 ms)" in said
