@@ -100,7 +100,8 @@ class OffsetTracker:
         asked_ns = self._clock.now_ns()
         payload = self._transport.query(topics.CLOCK, timeout_s=EXCHANGE_TIMEOUT_S)
         returned_ns = self._clock.now_ns()
-        if payload is None:
+        # What took no time, or far more than it may, was cut in two by a jump of this clock, and tells nothing.
+        if payload is None or not 0 <= returned_ns - asked_ns <= 2e9 * EXCHANGE_TIMEOUT_S:
             self._unanswered += 1
             return
         try:

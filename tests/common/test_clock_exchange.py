@@ -162,6 +162,20 @@ def test_a_jump_is_logged_with_its_size_and_counted(scene, caplog):
     assert scene.offset_s == pytest.approx(-1.75, abs=1e-4)
 
 
+@pytest.mark.parametrize("jump_s", [-40.0, 40.0])
+def test_a_jump_while_a_question_is_out_is_told_too(scene, caplog, jump_s):
+    scene.bridge()
+    scene.tracker.start()
+    scene.run(1.41)  # ten exchanges of 40 ms and their pauses; the eleventh has begun
+    assert scene.tracker.details()["exchanges"] == 10
+    scene.own_clock.jump(jump_s)
+    scene.run(0.6)
+    assert scene.tracker.details()["unanswered"] == 1
+    assert scene.tracker.details()["jumps"] == 1
+    assert f"jumped: they are {-jump_s:+.3f} s further apart" in caplog.text
+    assert scene.offset_s == pytest.approx(-3.0 - jump_s, abs=1e-4)
+
+
 def test_asking_ends_at_once_and_survives_a_session_that_closes_first(scene):
     scene.bridge()
     scene.tracker.start()

@@ -242,6 +242,16 @@ def check_actions(steps, actions, spec):
     return compared
 
 
+def check_times(actions, reading):
+    """An action's times are in order; return how many knew the bridge's clock, and the newest of their offsets."""
+    known = [action for action in actions.values() if action["offset_bound_ns"] >= 0]
+    for action in actions.values():
+        assert 0 < action["received_ns"] <= action["began_ns"] <= action["sent_ns"]
+    for action in known:  # what the actor says the bridge's clock showed lies between the run's start and now
+        assert 0 < action["sent_ns"] + action["offset_ns"] <= reading["answered_ns"] + action["offset_bound_ns"]
+    return len(known), known[-1]["offset_ns"], known[-1]["offset_bound_ns"]
+
+
 def check_experiences(experiences, steps, actions):
     """Return how many experiences were compared with their time steps, and how many with their actions."""
     compared = answered = 0
@@ -373,6 +383,9 @@ def main(document_file, run, robot, *endpoints):
         listener.sizes |= dict(zip("HWC", spec["frame_shape"].tolist(), strict=True))
         tables.check("TaskSpec", spec, dict(listener.sizes))
         listener.until(listener.enough, "enough of everything")
+        reading = client.decode(client.ask(session, f"{root}/clock"), "ClockReading")
+        tables.check("ClockReading", reading, {})
+        assert reading["received_ns"] <= reading["answered_ns"]
         cached = client.decode(client.ask(session, f"{root}/policy/@adv/pub/**?_max=1;_anyke"), "PolicyWeights")
         refusals = {}
         for service in SERVICES:
@@ -412,6 +425,8 @@ def main(document_file, run, robot, *endpoints):
     assert finished[0] >= max(steps) + 1
     stacks = rebuilt_stacks(steps, spec["frame_stack"], observation)
     experience_steps, experience_actions = check_experiences(experiences, steps, actions)
+    assert reading["incarnation"] == incarnations["robot_bridge"]
+    knew_offset, *offset = check_times(actions, reading)
     densities = check_log_probabilities(steps, stacks, actions, heard["policy"], spec, policy)
     assert set(policy.parameters(cached)) == set(policy.parameters(heard["policy"][-1]))
     modules = [str(getattr(module, "__file__", None)) for module in sys.modules.values()]
@@ -424,6 +439,7 @@ def main(document_file, run, robot, *endpoints):
         "compared": {
             "consecutive time steps": check_time_steps(steps, spec),
             "time steps with actions": check_actions(steps, actions, spec),
+            "actions with a clock's offset": knew_offset,
             "experiences with time steps": experience_steps,
             "experiences with actions": experience_actions,
             "log-probabilities, initial policy": densities["initial"],
@@ -431,6 +447,7 @@ def main(document_file, run, robot, *endpoints):
             "minibatch transitions": check_minibatches(heard["minibatch/arrays"], steps, stacks),
         },
         "cached_policy": cached["version"],
+        "offset": offset,
         "refusals": refusals,
         "counters": {
             service: sorted({name for s in heard["status"] if s["service"] == service for name in s["counters"]})
