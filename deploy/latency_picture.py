@@ -17,8 +17,10 @@ DRAWN = ("p50", "p90", "p99")
 _COLOURS = dict(zip(PARTS, ("#8c8c8c", "#c9a227", "#1f77b4", "#b5d0ea", "#d1495b", "#2a9d8f", "#6a4c93"), strict=True))
 """The two ways and the computation stand out; what only waits is pale."""
 _LABELS = {"apply": "wait to apply"}
-_WRITTEN_SHARE = 0.05
-"""A part narrower than this share of the widest bar has no room for its number."""
+_PALE = ("encode", "queue")
+_WRITTEN_SHARE = 0.04
+"""A part narrower than this share of the axis has no room for its number."""
+_LINEAR_BELOW_MS = 0.1
 
 
 @dataclass(frozen=True)
@@ -40,46 +42,46 @@ def draw_latency(to: Path | BinaryIO, runs: Sequence[RunBars]) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    heights = [1.5 + 0.75 * len(runs), 1.4 + 0.2 * len(PARTS) * (len(runs) + 1)]
+    heights = [1.4 + 0.75 * len(runs), 1.4 + 0.2 * len(PARTS) * (len(runs) + 0.5)]
     figure = Figure(figsize=(11.0, sum(heights)), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     stacks, spreads = figure.subplots(2, 1, gridspec_kw={"height_ratios": heights})
     _draw_stacks(stacks, runs)
     _draw_spreads(spreads, runs)
+    for axes in (stacks, spreads):
+        axes.grid(axis="x", alpha=0.3)
+        axes.set_axisbelow(True)
+        axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=9, frameon=False)
     figure.savefig(to, format="png", metadata={"Title": "Where the latency goes"})
 
 
 def _draw_stacks(axes: Axes, runs: Sequence[RunBars]) -> None:
-    widest = max(sum(max(part["p50"], 0.0) for part in run.parts.values()) for run in runs)
+    room = 1.45 * max(sum(max(part["p50"], 0.0) for part in run.parts.values()) for run in runs)
     for at, run in enumerate(runs):
         left = 0.0
         for part, values in run.parts.items():
             width = max(values["p50"], 0.0)
             label = _LABELS.get(part, part) if at == _first_with(runs, part) else None
             axes.barh(at, width, left=left, height=0.55, color=_COLOURS[part], label=label)
-            if width > _WRITTEN_SHARE * widest:
-                colour = "black" if part in ("queue", "encode") else "white"
+            if width > _WRITTEN_SHARE * room:
+                colour = "black" if part in _PALE else "white"
                 axes.text(left + width / 2, at, f"{width:.1f}", ha="center", va="center", color=colour, fontsize=9)
             left += width
-        for quantile, marker in zip(DRAWN, ("|", "d", "o"), strict=True):
-            label = f"age, {quantile}" if at == 0 else None
-            axes.plot(run.age[quantile], at + 0.4, marker, color="black", markersize=6, label=label, clip_on=False)
+        age = " / ".join(f"{run.age[quantile]:.1f}" for quantile in DRAWN)
+        axes.text(left, at, f"  age {age} ms\n  ({' / '.join(DRAWN)})", va="center", fontsize=9)
     axes.set_yticks(range(len(runs)), [f"{run.label}\nclock ± {run.offset_bound:.2f} ms" for run in runs], fontsize=9)
-    axes.set_ylim(len(runs) - 0.4, -0.5)
-    axes.set_xlim(left=0.0)
+    axes.set_ylim(len(runs) - 0.5, -0.5)
+    axes.set_xlim(0.0, max(room, 1e-3))
     axes.set_xlabel("ms")
     axes.set_title(
         "Age of an action when the robot obeys it: median of each part\n"
         "(one way may seem too long, and the other too short, by at most the clock's error)",
         fontsize=11,
     )
-    axes.grid(axis="x", alpha=0.3)
-    axes.set_axisbelow(True)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=9, frameon=False)
 
 
 def _draw_spreads(axes: Axes, runs: Sequence[RunBars]) -> None:
-    """Each part's median, with a line to its 99th percentile and a mark at its 90th; one colour for a run."""
+    """Each part's median, with a line over its 90th to its 99th percentile; one colour for a run."""
     from matplotlib import colormaps
 
     colours = colormaps["tab10"].colors  # type: ignore[attr-defined]
@@ -91,18 +93,19 @@ def _draw_spreads(axes: Axes, runs: Sequence[RunBars]) -> None:
             if values := run.parts.get(part):
                 y = at - 0.4 + room * (number + 0.5)
                 label = run.label.splitlines()[0] if part == next(iter(run.parts)) else None
-                axes.barh(y, values["p50"], height=0.8 * room, color=colour, alpha=0.85, label=label)
-                axes.plot([values["p50"], values["p99"]], [y, y], "-", color="black", linewidth=1.0)
-                axes.plot([values["p90"]], [y], "|", color="black", markersize=7)
-                axes.text(values["p99"], y, f" {values['p50']:.2f} – {values['p99']:.2f}", va="center", fontsize=8)
+                axes.plot([values[name] for name in DRAWN], [y] * len(DRAWN), "-|", color=colour, markersize=7)
+                axes.plot([values["p50"]], [y], "o", color=colour, markersize=6, label=label)
+                text = f"  {values['p50']:.2f} – {values['p99']:.2f}"
+                axes.text(max(values.values()), y, text, va="center", fontsize=8)
+    longest = max(values["p99"] for run in runs for values in run.parts.values())
+    least = min(values["p50"] for run in runs for values in run.parts.values())
+    # From hundredths to hundreds: only a logarithmic axis shows both ends; below a tenth it is linear, for 0 is there.
+    axes.set_xscale("symlog", linthresh=_LINEAR_BELOW_MS)
+    axes.set_xlim(min(0.0, 1.3 * least), 4.0 * max(longest, _LINEAR_BELOW_MS))
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.set_yticks(range(len(shown)), [_LABELS.get(part, part) for part in shown])
     axes.set_ylim(len(shown) - 0.5, -0.5)
-    longest = max(values["p99"] for run in runs for values in run.parts.values())
-    axes.set_xlim(0.0, 1.2 * longest)  # room for the numbers
-    axes.set_xlabel("ms: bar p50, tick p90, end of the line p99")
-    axes.grid(axis="x", alpha=0.3)
-    axes.set_axisbelow(True)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=9, frameon=False)
+    axes.set_xlabel("ms (dot: p50, ticks: p90 and p99)")
 
 
 def _first_with(runs: Sequence[RunBars], part: str) -> int | None:

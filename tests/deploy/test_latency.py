@@ -78,6 +78,13 @@ def test_the_picture_is_in_the_first_run_s_folder_unless_told(tmp_path):
     assert (tmp_path / "latency.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("row", [(0,) * 8, (None, 0, -0.2, 0, 0, 0.1, 0, 0.5)], ids=["no time at all", "below zero"])
+def test_a_picture_of_nothing_much_can_be_drawn(tmp_path, row):
+    write_ages(tmp_path, [row] * 3)
+    assert latency.main([str(tmp_path)]) == 0
+    assert (tmp_path / "latency.png").exists()
+
+
 def test_a_run_in_which_nothing_was_applied_is_an_error_that_says_what_there_is(tmp_path, capsys):
     write_ages(tmp_path, [(1, 2, 3, 4, 5, 6, None, 0.5), (1, 2, None, 4, 5, None, 7, None)])
     assert latency.main([str(tmp_path)]) == 1
