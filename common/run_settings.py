@@ -54,7 +54,7 @@ class TransportSettings:
 class ClockSettings:
     """``[clock]``: makes this service's clock another one than its computer's, to try on one computer what two are.
 
-    Not for the bridge of an emulated network: whose outages are recorded by the computer's own clock.
+    Not for the bridge on an emulated network, whose outages are recorded by the computer's own clock.
     """
 
     offset_s: float = setting(0.0, low=0.0, high=1e6)

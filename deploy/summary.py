@@ -138,6 +138,8 @@ def summarise(record: Record) -> Summary:
     produced, persisted = run_parts.produced(parts), run_parts.persisted(parts)
     if persisted is None:
         warnings.append("replay left no count of what it has persisted")
+    for service, jumps in run_parts.clock_jumps(parts).items():
+        notes.append(f"{service}: its clock and the bridge's jumped against each other ({jumps} x)")
     values = {
         "task": run.task if run else run_parts.newest_detail(parts, ROBOT_BRIDGE, "task"),
         "algorithm": run.algorithm if run else None,

@@ -180,6 +180,15 @@ def test_the_medians_of_an_action_s_age_are_told_with_the_clocks_error(tmp_path:
     assert "29.00 ms of age (p50): camera 1.00, encode 2.00, uplink 4.00" in summary_text(values)
 
 
+def test_a_clock_that_jumped_is_noted(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    write_part(tmp_path, "actor", 111, clock={"offset_s": 3.0, "jumps": 2})
+    write_part(tmp_path, "actor", 112, clock={"jumps": 1})
+    write_part(tmp_path, "replay", 131, clock={"jumps": 0})
+    notes = summarise(read_record(tmp_path)).values["notes"]
+    assert notes == ["actor: its clock and the bridge's jumped against each other (3 x)"]
+
+
 def test_in_simulated_time_an_action_has_no_age(tmp_path: Path) -> None:
     write_run(tmp_path)
     replace(RUN, mode="in_process").write(tmp_path)
