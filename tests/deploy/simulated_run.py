@@ -116,6 +116,6 @@ def simulate(
             event(hosts)
     finally:
         for service in services.values():
-            service.record.close()
+            service.record.close(timeout_s=60.0)
         clock.end()
     return hosts

@@ -242,14 +242,23 @@ def check_actions(steps, actions, spec):
     return compared
 
 
-def check_times(actions, reading):
-    """An action's times are in order; return how many knew the bridge's clock, and the newest of their offsets."""
-    known = [action for action in actions.values() if action["offset_bound_ns"] >= 0]
+def check_times(steps, actions):
+    """Times are in order on each clock and, by the offset, on both; return how often, and the newest offset."""
     for action in actions.values():
         assert 0 < action["received_ns"] <= action["began_ns"] <= action["sent_ns"]
-    for action in known:  # what the actor says the bridge's clock showed lies between the run's start and now
-        assert 0 < action["sent_ns"] + action["offset_ns"] <= reading["answered_ns"] + action["offset_bound_ns"]
-    return len(known), known[-1]["offset_ns"], known[-1]["offset_bound_ns"]
+    compared = 0
+    for step in steps.values():
+        action = actions.get(step["answered_seq"])
+        observed = steps.get(step["answered_seq"])
+        if action is None or observed is None or action["offset_bound_ns"] < 0:
+            continue
+        compared += 1
+        bound = action["offset_bound_ns"]
+        received, sent = (action[name] + action["offset_ns"] for name in ("received_ns", "sent_ns"))
+        assert observed["published_ns"] <= received + bound
+        assert sent - bound <= step["action_applied_ns"]
+    newest = actions[max(actions)]
+    return compared, newest["offset_ns"], newest["offset_bound_ns"]
 
 
 def check_experiences(experiences, steps, actions):
@@ -426,7 +435,7 @@ def main(document_file, run, robot, *endpoints):
     stacks = rebuilt_stacks(steps, spec["frame_stack"], observation)
     experience_steps, experience_actions = check_experiences(experiences, steps, actions)
     assert reading["incarnation"] == incarnations["robot_bridge"]
-    knew_offset, *offset = check_times(actions, reading)
+    times, *offset = check_times(steps, actions)
     densities = check_log_probabilities(steps, stacks, actions, heard["policy"], spec, policy)
     assert set(policy.parameters(cached)) == set(policy.parameters(heard["policy"][-1]))
     modules = [str(getattr(module, "__file__", None)) for module in sys.modules.values()]
@@ -439,7 +448,7 @@ def main(document_file, run, robot, *endpoints):
         "compared": {
             "consecutive time steps": check_time_steps(steps, spec),
             "time steps with actions": check_actions(steps, actions, spec),
-            "actions with a clock's offset": knew_offset,
+            "times on two clocks": times,
             "experiences with time steps": experience_steps,
             "experiences with actions": experience_actions,
             "log-probabilities, initial policy": densities["initial"],
