@@ -114,10 +114,13 @@ class OffsetTracker:
         if reading.incarnation != self._bridge:
             self._bridge = reading.incarnation
             self._estimator.forget()
-        jumps = self._estimator.jumps
+        before = self._estimator.jumps
         self._estimate = self._estimator.add(exchange)
-        if self._estimator.jumps > jumps:
+        jumps = self._estimator.jumps
+        # The first, the second, the fourth ...: a clock that is being set right by force seems to jump all the time.
+        if jumps > before and jumps & before == 0:
             logger.warning(
-                "this computer's clock or the bridge's has jumped: they are %+.3f s further apart; starting anew",
+                "this computer's clock or the bridge's has jumped: they are %+.3f s further apart; begun anew (%d x)",
                 self._estimator.last_jump_ns / 1e9,
+                jumps,
             )

@@ -162,6 +162,18 @@ def test_a_jump_is_logged_with_its_size_and_counted(scene, caplog):
     assert scene.offset_s == pytest.approx(-1.75, abs=1e-4)
 
 
+def test_a_clock_that_jumps_all_the_time_does_not_fill_the_log(scene, caplog):
+    scene.bridge()
+    scene.tracker.start()
+    for _ in range(20):
+        scene.run(2.0)
+        scene.own_clock.jump(1.0)
+    scene.run(1.0)
+    assert scene.tracker.details()["jumps"] == 20
+    assert [record.args[1] for record in caplog.records if "jumped" in record.msg] == [1, 2, 4, 8, 16]
+    assert scene.offset_s == pytest.approx(-23.0, abs=1e-3)
+
+
 @pytest.mark.parametrize("jump_s", [-40.0, 40.0])
 def test_a_jump_while_a_question_is_out_is_told_too(scene, caplog, jump_s):
     scene.bridge()
