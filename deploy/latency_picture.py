@@ -56,13 +56,15 @@ def draw_latency(to: Path | BinaryIO, runs: Sequence[RunBars]) -> None:
 
 
 def _draw_stacks(axes: Axes, runs: Sequence[RunBars]) -> None:
+    for part in PARTS:  # the legend in the order in which they pass, whichever run has which
+        if _first_with(runs, part) is not None:
+            axes.barh(0, 0.0, color=_COLOURS[part], label=_LABELS.get(part, part))
     room = 1.45 * max(sum(max(part["p50"], 0.0) for part in run.parts.values()) for run in runs)
     for at, run in enumerate(runs):
         left = 0.0
         for part, values in run.parts.items():
             width = max(values["p50"], 0.0)
-            label = _LABELS.get(part, part) if at == _first_with(runs, part) else None
-            axes.barh(at, width, left=left, height=0.55, color=_COLOURS[part], label=label)
+            axes.barh(at, width, left=left, height=0.55, color=_COLOURS[part])
             if width > _WRITTEN_SHARE * room:
                 colour = "black" if part in _PALE else "white"
                 axes.text(left + width / 2, at, f"{width:.1f}", ha="center", va="center", color=colour, fontsize=9)
@@ -101,7 +103,7 @@ def _draw_spreads(axes: Axes, runs: Sequence[RunBars]) -> None:
     least = min(values["p50"] for run in runs for values in run.parts.values())
     # From hundredths to hundreds: only a logarithmic axis shows both ends; below a tenth it is linear, for 0 is there.
     axes.set_xscale("symlog", linthresh=_LINEAR_BELOW_MS)
-    axes.set_xlim(min(0.0, 1.3 * least), 4.0 * max(longest, _LINEAR_BELOW_MS))
+    axes.set_xlim(min(0.0, 1.3 * least), 7.0 * max(longest, _LINEAR_BELOW_MS))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.set_yticks(range(len(shown)), [_LABELS.get(part, part) for part in shown])
     axes.set_ylim(len(shown) - 0.5, -0.5)
