@@ -213,7 +213,7 @@ def message_sizes(spec: TaskSpec) -> tuple[int, int]:
 
     observed = next(islice(recorded_experience(spec), 1, None)).time_step
     now_ns, incarnation, seq = time.monotonic_ns(), time.time_ns(), 200
-    action = Action(incarnation, incarnation, seq, observed.action, -1.5, 0, now_ns, now_ns)
+    action = Action(incarnation, incarnation, seq, observed.action, -1.5, 0, now_ns, now_ns, now_ns, 0, -1)
     time_step = TimeStep(**new_observation(observed, seq, incarnation, now_ns))
     return len(encode(time_step)), len(encode(action))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -59,6 +60,45 @@ class SystemClock(_SystemThreads):
     def wait_until(self, deadline_ns: int, condition: threading.Condition) -> bool:
         remaining_s = (deadline_ns - time.monotonic_ns()) / 1e9
         return remaining_s > 0 and condition.wait(remaining_s)
+
+
+class SkewedClock:
+    """Shows another time than the clock beneath, as another computer's does: off by an offset, faster by a drift.
+
+    What waits, waits on the clock beneath, for the time that this one shows.
+    """
+
+    def __init__(self, beneath: Clock, offset_s: float = 0.0, drift_ppm: float = 0.0) -> None:
+        self._beneath = beneath
+        self._rate = 1.0 + drift_ppm * 1e-6
+        self._begun_ns = beneath.now_ns()
+        self._offset_ns = round(offset_s * 1e9)
+
+    def now_ns(self) -> int:
+        """See :class:`Clock`."""
+        passed_ns = self._beneath.now_ns() - self._begun_ns
+        return self._begun_ns + self._offset_ns + math.floor(passed_ns * self._rate)
+
+    def jump(self, seconds: float) -> None:
+        """Show a time that much later, or earlier, from now on."""
+        self._offset_ns += round(seconds * 1e9)
+
+    def wait_until(self, deadline_ns: int, condition: threading.Condition) -> bool:
+        """See :class:`Clock`."""
+        passed_ns = (deadline_ns - self._begun_ns - self._offset_ns) / self._rate
+        return self._beneath.wait_until(self._begun_ns + math.ceil(passed_ns), condition)
+
+    def wait(self, condition: threading.Condition, timeout_s: float | None = None) -> bool:
+        """See :class:`Clock`."""
+        return self._beneath.wait(condition, None if timeout_s is None else timeout_s / self._rate)
+
+    def condition(self) -> threading.Condition:
+        """See :class:`Clock`."""
+        return self._beneath.condition()
+
+    def thread(self, target: Callable[[], None], name: str) -> threading.Thread:
+        """See :class:`Clock`."""
+        return self._beneath.thread(target, name)
 
 
 class FakeClock(_SystemThreads):

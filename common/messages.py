@@ -147,6 +147,18 @@ class TaskSpec:
 
 
 @dataclass(frozen=True)
+class ClockReading:
+    """What the bridge's clock shows: the answer to a query on ``clock``, by which others find their offset to it."""
+
+    incarnation: Count
+    """Start of the bridge process, nanoseconds since 1970: another one may run on another computer."""
+    received_ns: Count
+    """When the question came, bridge's monotonic clock."""
+    answered_ns: Count
+    """When this answer was made, bridge's monotonic clock."""
+
+
+@dataclass(frozen=True)
 class TimeStep:
     """The observation o_t and what led into it: action, reward, and how the attempt stands.
 
@@ -165,7 +177,7 @@ class TimeStep:
     step_index: Count
     """Action cycles since the attempt began; 0 for its first TimeStep."""
     published_ns: Count
-    """When the bridge published this TimeStep, its monotonic clock."""
+    """When the bridge had read its sensors and began to publish this TimeStep, its monotonic clock."""
     frame_ids: Annotated[Int64Array, Array("int64", ("k",))]
     """Consecutive ids of the camera frames that are new since the TimeStep before."""
     frame_capture_ns: Annotated[Int64Array, Array("int64", ("k",))]
@@ -227,8 +239,14 @@ class Action:
     """Version of the policy that acted; 0 is the initial policy."""
     received_ns: Count
     """When the TimeStep arrived, actor's monotonic clock."""
+    began_ns: Count
+    """When the policy began to compute, actor's monotonic clock."""
     sent_ns: Count
-    """When the action was sent, actor's monotonic clock."""
+    """When the action was computed and sent, actor's monotonic clock."""
+    offset_ns: Annotated[int, Bounds(low=-(2**62), high=2**62)]
+    """Bridge's monotonic clock minus the actor's at ``sent_ns``, as the actor knows it (``clock``); else 0."""
+    offset_bound_ns: Annotated[int, Bounds(low=-1, high=2**62)]
+    """Largest error of ``offset_ns``; -1 where the actor does not know the offset."""
 
 
 @dataclass(frozen=True)
@@ -432,6 +450,7 @@ class CommandReply:
 
 MESSAGES: tuple[type, ...] = (
     TaskSpec,
+    ClockReading,
     TimeStep,
     Action,
     Experience,

@@ -18,9 +18,11 @@ from typing import Any, NoReturn, TypeVar
 
 import tomli_w
 
+from common.clock import Clock, SkewedClock, SystemClock
 from common.config import load_config, to_tables
 from common.errors import RelodError, ServiceError
 from common.record import write_atomically
+from common.run_settings import ClockSettings
 from common.service import Service
 from common.transport import ZenohTransport
 
@@ -79,7 +81,7 @@ def end_process(exit_code: int) -> NoReturn:
 def _run(name: str, config: Any, serve: Callable[[Service, Any], None]) -> int:
     # The interpreter's default of 5 ms is how long a computing thread may keep a waiting real-time thread out.
     sys.setswitchinterval(5e-4)
-    service = Service(name, config.run, ZenohTransport(config.run, config.transport))
+    service = Service(name, config.run, ZenohTransport(config.run, config.transport), _clock(config.clock))
     _stop_on_signals(service)
     _keep_configuration(name, config)
     logger.info("%s starts: run %s, process %d", name, config.run.id, os.getpid())
@@ -110,6 +112,13 @@ def _run(name: str, config: Any, serve: Callable[[Service, Any], None]) -> int:
     if service.record.part_error:
         raise ServiceError(f"the end of this service is not in the run's record: {service.record.part_error}")
     return 0
+
+
+def _clock(settings: ClockSettings) -> Clock:
+    if settings == ClockSettings():
+        return SystemClock()
+    logger.warning("[clock]: not this computer's clock but one that is off by %s", settings)
+    return SkewedClock(SystemClock(), settings.offset_s, settings.drift_ppm)
 
 
 def _keep_configuration(name: str, config: Any) -> None:

@@ -51,6 +51,19 @@ class TransportSettings:
 
 
 @dataclass(frozen=True)
+class ClockSettings:
+    """``[clock]``: makes this service's clock another one than its computer's, to try on one computer what two are.
+
+    Not for the bridge on an emulated network, whose outages are recorded by the computer's own clock.
+    """
+
+    offset_s: float = setting(0.0, low=0.0, high=1e6)
+    """How much later it shows, seconds."""
+    drift_ppm: float = setting(0.0, low=-500.0, high=500.0)
+    """How much faster it goes, microseconds per second."""
+
+
+@dataclass(frozen=True)
 class AlgorithmSettings:
     """``[algorithm]``: what learns. Other keys of the section override the preset's, e.g. ``batch_size = 64``."""
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from common import topics
 from common.clock import Clock, SystemClock
+from common.clock_exchange import UNKNOWN, OffsetTracker, serve_clock
 from common.codec import decode, encode
 from common.errors import MessageError, ServiceError
 from common.inbox import Inbox, Refusals
@@ -86,6 +87,11 @@ class Service:
         self._peers: dict[str, Peer] = {}
         self._foreign: set[str] = set()
         self._finished: Finished | None = None
+        self._offset: OffsetTracker | None = None
+        if name == topics.ROBOT_BRIDGE:
+            serve_clock(transport, self.clock, self.incarnation)
+        else:
+            self._offset = OffsetTracker(name, transport, self.clock, self.refusals)
         self._heart_wake = self.clock.condition()
         self._heart = self.clock.thread(self._beat, f"{name} heartbeat")
         self._heart_stop = False
@@ -110,6 +116,8 @@ class Service:
         """Begin the heartbeat and the record."""
         self.record.start()
         self._heart.start()
+        if self._offset:
+            self._offset.start()
 
     def stop(self, reason: str) -> None:
         """Ask the service's loop to end."""
@@ -128,6 +136,8 @@ class Service:
     def close(self) -> None:
         """Say goodbye, write the last part, leave the mesh."""
         self.state = "stopped"
+        if self._offset:
+            self._offset.stop()
         with self._heart_wake:
             self._heart_stop = True
             self._heart_wake.notify()
@@ -163,6 +173,10 @@ class Service:
         """A count that ``service`` last reported; 0 before it did."""
         peer = self._peers.get(service)
         return peer.status.counters.get(name, 0.0) if peer else 0.0
+
+    def bridge_offset(self, now_ns: int) -> tuple[int, int]:
+        """Bridge's clock minus this service's at ``now_ns`` and the largest error of that, ns; (0, -1) if unknown."""
+        return self._offset.at(now_ns) if self._offset else UNKNOWN
 
     def query_spec(self) -> TaskSpec | None:
         """Ask the bridge what the task looks like until it answers; None if stopped, or the run is over, first."""
@@ -313,6 +327,7 @@ class Service:
                 "bytes_received": dict(self.transport.bytes_received),
                 "refused_messages": dict(self.refusals.counts),
                 "record_entries_dropped": self.record.dropped,
+                **({"clock": self._offset.details()} if self._offset else {}),
                 **self.details(),
             }
         )

@@ -69,6 +69,7 @@ _NEWEST, _NUMBERED, _CACHED, _QUERY = Delivery.NEWEST, Delivery.NUMBERED, Delive
 
 # fmt: off
 SPEC = Topic("spec", m.TaskSpec, (ROBOT_BRIDGE,), (ACTOR, REPLAY, LEARNER), _QUERY, _REAL_TIME, "at start")
+CLOCK = Topic("clock", m.ClockReading, (ROBOT_BRIDGE,), (ACTOR, REPLAY, LEARNER), _QUERY, _REAL_TIME, "0.1 s, 1 s")
 TIME_STEP = Topic("timestep", m.TimeStep, (ROBOT_BRIDGE,), (ACTOR,), _NUMBERED, _REAL_TIME, "action cycle", urgent=True)
 TIME_STEP_RESENT = Topic("timestep/resent", m.TimeStep, (ROBOT_BRIDGE,), (ACTOR,), _NUMBERED, _BULK, "gaps, paced")
 TIME_STEP_HEAD = Topic("timestep/head", m.StreamHead, (ROBOT_BRIDGE,), (ACTOR,), _NEWEST, _REAL_TIME, "0.2 s")
@@ -91,6 +92,7 @@ FINISHED = Topic("finished", m.Finished, (ROBOT_BRIDGE,), (ACTOR, REPLAY, LEARNE
 
 TOPICS = (
     SPEC,
+    CLOCK,
     TIME_STEP,
     TIME_STEP_RESENT,
     TIME_STEP_HEAD,

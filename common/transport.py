@@ -4,7 +4,7 @@ This is the only file that imports zenoh. Both transports pass the same conforma
 
 * callbacks run on a receiving thread: they enqueue and return, nothing else (a slow one stalls every priority);
 * ``put`` never waits for the network, except on a topic that ``waits``, which wants a thread of its own;
-* ``put`` on a closed transport is a :class:`~common.errors.TransportError`;
+* ``put`` and ``query`` on a closed transport are a :class:`~common.errors.TransportError`;
 * a query that nobody answers returns None, at the latest after its time-out.
 """
 
@@ -163,10 +163,13 @@ class ZenohTransport:
 
     def query(self, topic: Topic, payload: bytes = b"", timeout_s: float = 1.0) -> bytes | None:
         key = topic.key(self._run.id, self._run.robot)
-        for reply in self._sessions[topic.lane].get(key, payload=payload, timeout=timeout_s):
-            if reply.ok is not None:
-                received: bytes = reply.ok.payload.to_bytes()
-                return received
+        try:
+            for reply in self._sessions[topic.lane].get(key, payload=payload, timeout=timeout_s):
+                if reply.ok is not None:
+                    received: bytes = reply.ok.payload.to_bytes()
+                    return received
+        except self._zenoh.ZError as error:
+            raise TransportError(f"query on {key}: {_first_line(error)}") from error
         return None
 
     def close(self) -> None:
@@ -246,6 +249,10 @@ class InMemoryNetwork:
         for callback in callbacks:
             callback(payload)
 
+    def ask(self, topic: Topic, payload: bytes, answer: Answer, timeout_s: float) -> bytes | None:
+        """Carry a question to ``answer`` and its answer back, or None if that takes longer than ``timeout_s``."""
+        return answer(payload)
+
 
 class InMemoryTransport:
     """One service's session on an :class:`InMemoryNetwork`."""
@@ -295,9 +302,12 @@ class InMemoryTransport:
             self._network.answers[topic.key(self._run.id, self._run.robot)] = (self, answer)
 
     def query(self, topic: Topic, payload: bytes = b"", timeout_s: float = 1.0) -> bytes | None:
+        key = topic.key(self._run.id, self._run.robot)
+        if self._closed:
+            raise TransportError(f"query on {key}: the session is closed")
         with self._network.lock:
-            served = self._network.answers.get(topic.key(self._run.id, self._run.robot))
-        return served[1](payload) if served else None
+            served = self._network.answers.get(key)
+        return self._network.ask(topic, payload, served[1], timeout_s) if served else None
 
     def close(self) -> None:
         self._closed = True

@@ -116,6 +116,14 @@ def newest_detail(parts: RunParts, service: str, name: str) -> Any:
     return next((part[name] for part in reversed(parts.of(service)) if part.get(name) is not None), None)
 
 
+def clock_jumps(parts: RunParts) -> dict[str, int]:
+    """Service -> how often it saw the bridge's clock jump against its own; without those that never did."""
+    counts: Counter[str] = Counter()
+    for part in parts.parts:
+        counts[part["service"]] += int(part.get("clock", {}).get("jumps", 0))
+    return {service: count for service, count in counts.items() if count}
+
+
 def service_failures(parts: RunParts) -> list[dict[str, Any]]:
     """Incarnations that failed, or never said that they had stopped."""
     failures = []

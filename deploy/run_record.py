@@ -10,6 +10,7 @@ from typing import Any
 
 from common.errors import ConfigError, RelodError, RingError
 from common.record import settle_parts
+from deploy.action_age import ActionAges
 from deploy.actions import ArrivedActions
 from deploy.episodes import Episode, EpisodeTable
 from deploy.mirror import HOSTS_FOLDER, RING_COUNTS, read_ring_counts
@@ -39,6 +40,7 @@ class Record:
     run: RunFile | None
     episodes: list[Episode]
     actions: ArrivedActions | None
+    ages: ActionAges | None
     ring: RingContent | None
     network: NetworkPart | None
     warnings: list[str] = field(default_factory=list)
@@ -81,6 +83,7 @@ def read_record(*run_dirs: Path) -> Record:
         run=attempt(lambda: RunFile.read(_folder_with(run_dirs, "run.toml"))),
         episodes=table.episodes,
         actions=actions,
+        ages=_read_ages(_folder_with(folders, "actions.csv")),
         ring=attempt(lambda: _read_ring_content(folders)),
         network=attempt(lambda: _read_network(_folder_with(run_dirs, "network.json"))),
         warnings=warnings,
@@ -138,6 +141,13 @@ def read_ring(path: Path) -> RingContent:
     identities = rows[["incarnation", "seq"]]
     newest_ns = int(rows["published_ns"].max()) if len(rows) else 0
     return RingContent(len(rows) - len(np.unique(identities)), newest_ns)
+
+
+def _read_ages(run_dir: Path) -> ActionAges | None:
+    try:
+        return ActionAges.read(run_dir)
+    except ConfigError:
+        return None  # `python -m deploy.latency` says why; a run in which nothing was applied misses nothing
 
 
 def _read_network(run_dir: Path) -> NetworkPart | None:

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from common.errors import RelodError
 from common.record import write_atomically
 from common.topics import ACTOR, LEARNER, REPLAY, ROBOT_BRIDGE
@@ -53,6 +55,8 @@ def summarise(record: Record) -> Summary:
     produced, persisted = run_parts.produced(parts), run_parts.persisted(parts)
     if persisted is None:
         warnings.append("replay left no count of what it has persisted")
+    for service, jumps in run_parts.clock_jumps(parts).items():
+        notes.append(f"{service}: its clock and the bridge's jumped against each other ({jumps} x)")
     values = {
         "task": run.task if run else run_parts.newest_detail(parts, ROBOT_BRIDGE, "task"),
         "algorithm": run.algorithm if run else None,
@@ -80,6 +84,7 @@ def summarise(record: Record) -> Summary:
         "policy_version": _count(parts.greatest(LEARNER, "policy_version")),
         "rollouts": _rollouts(parts),
         "observation_to_action_ms": _observation_to_action_ms(record),
+        "action_age_ms": _action_age_ms(record),
         "outages": _outages(record, notes),
         "bytes_per_key": bytes_per_key(parts.bytes_sent()),
         "wall_s": run_parts.elapsed_s(parts),
@@ -131,6 +136,13 @@ def _observation_to_action_ms(record: Record) -> dict[str, float] | None:
     if record.actions is None or (record.run is not None and record.run.mode == IN_PROCESS):
         return None  # in simulated time, an answer takes as long as it is told to
     return record.actions.observation_to_action_ms()
+
+
+def _action_age_ms(record: Record) -> dict[str, float] | None:
+    if record.ages is None or (record.run is not None and record.run.mode == IN_PROCESS):
+        return None
+    medians = {name: values["p50"] for name, values in record.ages.quantiles_ms().items()}
+    return {**medians, "offset_bound": round(float(np.median(record.ages.offset_bound)), 3)}
 
 
 def _outages(record: Record, notes: list[str]) -> list[dict[str, float | None]] | None:

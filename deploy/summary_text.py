@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from deploy.run_file import IN_PROCESS
+from services.robot_bridge.action_age import PARTS
 
 _LABEL_WIDTH = 11
 
@@ -16,7 +17,11 @@ def summary_text(values: Mapping[str, Any]) -> str:
         ("run", _run(values)),
         ("steps", _steps(values)),
         # In simulated time there are no overruns and no latencies to report.
-        *([] if values["mode"] == IN_PROCESS else [("real time", _real_time(values)), ("answers", _answers(values))]),
+        *(
+            []
+            if values["mode"] == IN_PROCESS
+            else [("real time", _real_time(values)), ("answers", _answers(values)), ("latency", _age(values))]
+        ),
         ("experience", _experience(values)),
         ("learning", _learning(values)),
         ("network", _network(values)),
@@ -65,6 +70,14 @@ def _answers(values: Mapping[str, Any]) -> str:
     if delays is None:
         return "no action arrived"
     return f"{_known(delays['p50'], ' ms')} from observation to action (p50), {_known(delays['p99'], ' ms')} (p99)"
+
+
+def _age(values: Mapping[str, Any]) -> str:
+    medians = values["action_age_ms"]
+    if medians is None:
+        return ""
+    parts = ", ".join(f"{name} {medians[name]:.2f}" for name in PARTS if name in medians)
+    return f"{medians['age']:.2f} ms of age (p50): {parts}; uplink and downlink +- {medians['offset_bound']:.2f}"
 
 
 def _experience(values: Mapping[str, Any]) -> str:

@@ -16,6 +16,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
+import common.clock_exchange
 import common.frame_encoding
 import common.journal
 import common.messages
@@ -86,6 +87,8 @@ CONSTANTS = (
     (common.service, "DRAIN_TIMEOUT_S"),
     (common.service, "STOP_TIMEOUT_S"),
     (common.frame_encoding, "MAX_PIXEL_BYTES"),
+    (common.clock_exchange, "EXCHANGE_S"),
+    (common.clock_exchange, "EXCHANGE_TIMEOUT_S"),
     (common.journal, "HEAD_PERIOD_S"),
     (common.journal, "RESEND_AFTER_S"),
     (common.journal, "MAX_RANGES"),

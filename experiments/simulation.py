@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable
 
 from common.topics import Topic
-from common.transport import InMemoryNetwork, PayloadCallback
+from common.transport import Answer, InMemoryNetwork, PayloadCallback
 
 START_NS = 1_000_000_000
 
@@ -202,13 +202,35 @@ class SimulatedNetwork(InMemoryNetwork):
     def __init__(self, clock: SimulatedClock) -> None:
         super().__init__()
         self._clock = clock
-        self.delays_ns: dict[str, int] = {}
-        """Topic -> time from publication to arrival; 0 if not given."""
+        self.delays_ns: dict[str, int | Callable[[], int]] = {}
+        """Topic -> time from publication (of a query: from the answer) to arrival, each time or always; 0 if absent."""
+        self.question_delays_ns: dict[str, int | Callable[[], int]] = {}
+        """Topic of a query -> time from the question to its arrival."""
 
     def deliver(self, topic: Topic, payload: bytes, callbacks: list[PayloadCallback]) -> None:
         """See :class:`InMemoryNetwork`."""
-        delay_ns = self.delays_ns.get(topic.name, 0)
+        delay_ns = _drawn(self.delays_ns.get(topic.name, 0))
         if delay_ns:
             self._clock.call_later(delay_ns, lambda: super(SimulatedNetwork, self).deliver(topic, payload, callbacks))
         else:
             super().deliver(topic, payload, callbacks)
+
+    def ask(self, topic: Topic, payload: bytes, answer: Answer, timeout_s: float) -> bytes | None:
+        """See :class:`InMemoryNetwork`; whoever asks waits meanwhile."""
+        there_ns = _drawn(self.question_delays_ns.get(topic.name, 0))
+        back_ns = _drawn(self.delays_ns.get(topic.name, 0))
+        if there_ns + back_ns > timeout_s * 1e9:
+            self._pass(round(timeout_s * 1e9))
+            return None
+        self._pass(there_ns)
+        answered = answer(payload)
+        self._pass(back_ns)
+        return answered
+
+    def _pass(self, delay_ns: int) -> None:
+        if delay_ns:
+            self._clock.wait_until(self._clock.now_ns() + delay_ns, self._clock.condition())
+
+
+def _drawn(delay_ns: int | Callable[[], int]) -> int:
+    return delay_ns() if callable(delay_ns) else delay_ns

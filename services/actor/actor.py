@@ -35,6 +35,7 @@ class Computed:
     arrived: Arrived[TimeStep]
     chosen: ChosenAction
     policy_version: int
+    began_ns: int
     due_ns: int
 
 
@@ -149,21 +150,24 @@ class Actor:
         (arrived, observation), self._unanswered = self._unanswered, None
         if self._spec.pacing == "lockstep":
             self._wait_for_updates()
-        begun_ns = self._service.clock.now_ns()
-        policy = self._swap.policy
+        policy, clock = self._swap.policy, self._service.clock
+        began_ns = clock.now_ns()
         computed = Computed(
             arrived,
             policy.act(observation, self._rng),
             policy.version,
-            due_ns=begun_ns + round(self._settings.min_inference_s * 1e9),
+            began_ns,
+            due_ns=began_ns + round(self._settings.min_inference_s * 1e9),
         )
-        if self._service.clock.now_ns() >= computed.due_ns:
+        if clock.now_ns() >= computed.due_ns:
             self._answer(computed)
         else:
             self._computed = computed
 
     def _answer(self, computed: Computed) -> None:
         time_step, chosen = computed.arrived.message, computed.chosen
+        sent_ns = self._service.clock.now_ns()
+        offset_ns, offset_bound_ns = self._service.bridge_offset(sent_ns)
         answer = encode(
             Action(
                 actor_incarnation=self._service.incarnation,
@@ -173,7 +177,10 @@ class Actor:
                 log_probability=chosen.log_probability,
                 policy_version=computed.policy_version,
                 received_ns=computed.arrived.at_ns,
-                sent_ns=self._service.clock.now_ns(),
+                began_ns=computed.began_ns,
+                sent_ns=sent_ns,
+                offset_ns=offset_ns,
+                offset_bound_ns=offset_bound_ns,
             )
         )
         self._action_publisher.put(answer)

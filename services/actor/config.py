@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from common.config import setting
-from common.run_settings import AlgorithmSettings, JournalSettings, RunSettings, TransportSettings
+from common.run_settings import AlgorithmSettings, ClockSettings, JournalSettings, RunSettings, TransportSettings
 
 
 @dataclass(frozen=True)
@@ -28,5 +28,6 @@ class ActorConfig:
 
     run: RunSettings
     transport: TransportSettings
+    clock: ClockSettings
     algorithm: AlgorithmSettings
     actor: ActorSettings

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from common.config import setting
 from common.errors import ConfigError
-from common.run_settings import AlgorithmSettings, RunSettings, TransportSettings
+from common.run_settings import AlgorithmSettings, ClockSettings, RunSettings, TransportSettings
 
 
 def check_device_name(device: str) -> None:
@@ -56,5 +56,6 @@ class LearnerConfig:
 
     run: RunSettings
     transport: TransportSettings
+    clock: ClockSettings
     algorithm: AlgorithmSettings
     learner: LearnerSettings

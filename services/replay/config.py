@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from common.config import setting
-from common.run_settings import AlgorithmSettings, RunSettings, TransportSettings
+from common.run_settings import AlgorithmSettings, ClockSettings, RunSettings, TransportSettings
 
 
 @dataclass(frozen=True)
@@ -28,5 +28,6 @@ class ReplayConfig:
 
     run: RunSettings
     transport: TransportSettings
+    clock: ClockSettings
     algorithm: AlgorithmSettings
     replay: ReplaySettings

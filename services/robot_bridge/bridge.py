@@ -249,11 +249,13 @@ class RobotBridge:
     def _take_actions(self) -> None:
         if self._must_stop():
             self._stop_robot()
-        for arrived, published_ns in self._answers.take():
-            if self._is_wanted(arrived, published_ns):
-                self._apply(arrived)
+        for arrived, step in self._answers.take():
+            applied = False
+            if self._is_wanted(arrived, step.published_ns):
+                applied = self._apply(arrived)
             else:
                 self.counts.refused_actions += 1
+            self._answers.record(arrived, step, self._in_force.applied_ns if applied else None)
 
     def _must_stop(self) -> bool:
         """True if a latch has been set that the robot does not know of yet."""
@@ -268,12 +270,14 @@ class RobotBridge:
             return self._watchdog.latched is None
         return self._watchdog.accept(published_ns, arrived.at_ns)
 
-    def _apply(self, arrived: Arrived[Action]) -> None:
+    def _apply(self, arrived: Arrived[Action]) -> bool:
+        """Let the robot obey; False for the answer that only shows that the ring is closed."""
         self._engaged = True
         if self._probing:
-            return
+            return False
         clipped = np.clip(arrived.message.action, self._spec.action_low, self._spec.action_high)
         self._command(clipped, ActionSource.POLICY, arrived.message.answered_seq)
+        return True
 
     def _command(self, action: Float32Array, source: ActionSource, answered_seq: int) -> None:
         self._advance_world()
@@ -304,7 +308,7 @@ class RobotBridge:
             # Before it leaves: of a bridge that is killed now, nobody must see more than it has counted.
             keep_counts=self._keep_counts,
         )
-        self._answers.expect(time_step)
+        self._answers.expect(time_step, self._time_steps.sent_ns)
 
     # ------------------------------------------------------------------ beginning and end
 

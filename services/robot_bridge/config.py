@@ -7,7 +7,7 @@ from typing import Any
 
 from common.config import setting
 from common.frame_encoding import FrameEncoding
-from common.run_settings import JournalSettings, RunSettings, TransportSettings
+from common.run_settings import ClockSettings, JournalSettings, RunSettings, TransportSettings
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class RobotBridgeConfig:
 
     run: RunSettings
     transport: TransportSettings
+    clock: ClockSettings
     task: TaskSettings
     tasks: TaskTable
     robot_bridge: RobotBridgeSettings

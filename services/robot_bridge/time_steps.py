@@ -53,6 +53,8 @@ class TimeStepStream:
         self._service, self._counts = service, counts
         self._dimensions, self._encoding = spec.dimensions, spec.frame_encoding
         self._payload = b""
+        self.sent_ns = 0
+        """When the newest TimeStep was encoded and given to the network."""
         self.journal = JournalSender(
             service.transport,
             service.incarnation,
@@ -80,6 +82,7 @@ class TimeStepStream:
         Raises:
             ServiceError: a sensor or the reward is not finite or not of the TaskSpec's shape; nothing was published.
         """
+        published_ns = self._service.clock.now_ns()
         if not (np.isfinite(reading.proprioception).all() and np.isfinite(reward)):
             raise ServiceError(f"a sensor gave {reading.proprioception}, reward {reward}: expected finite numbers")
         self._check_shapes(reading)
@@ -93,7 +96,7 @@ class TimeStepStream:
             episode=ledger.episode,
             attempt=ledger.attempt,
             step_index=ledger.step_index,
-            published_ns=self._service.clock.now_ns(),
+            published_ns=published_ns,
             frame_ids=reading.frame_ids,
             frame_capture_ns=reading.frame_capture_ns,
             frames=frames,
@@ -111,6 +114,7 @@ class TimeStepStream:
         self._payload = encode(time_step)
         self._counts.produced += 1
         keep_counts()
+        self.sent_ns = self._service.clock.now_ns()
         self.journal.put(time_step.seq, self._payload)
         return time_step
 

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from common.clock import CycleKeeper, FakeClock, Lateness, SystemClock
+from common.clock import CycleKeeper, FakeClock, Lateness, SkewedClock, SystemClock
 
 MS = 1_000_000
 
@@ -156,3 +156,51 @@ def test_the_system_clock_returns_when_it_is_notified():
         thread.start()  # it gets the lock only while this thread waits
         assert clock.wait_until(clock.now_ns() + 10**11, condition) is True
     thread.join()
+
+
+# ------------------------------------------------------------------ another computer's clock
+
+
+def test_a_skewed_clock_is_off_by_its_offset_and_gains_its_drift():
+    beneath = FakeClock(1_000)
+    clock = SkewedClock(beneath, offset_s=3.0, drift_ppm=50.0)
+    assert clock.now_ns() == 3_000_001_000
+    beneath.advance(100.0)
+    assert clock.now_ns() == 103_000_001_000 + 5 * MS  # 50 us a second
+
+
+def test_a_skewed_clock_jumps_when_told():
+    clock = SkewedClock(FakeClock(1_000), drift_ppm=-20.0)
+    clock.jump(2.5)
+    assert clock.now_ns() == 2_500_001_000
+    clock.jump(-4.0)
+    assert clock.now_ns() == -1_499_999_000
+
+
+@pytest.mark.parametrize("drift_ppm", [-300.0, 0.0, 50.0, 499.0])
+def test_who_waits_on_a_skewed_clock_wakes_when_it_shows_the_deadline(drift_ppm):
+    beneath = FakeClock(123_456_789)
+    clock = SkewedClock(beneath, offset_s=1.7, drift_ppm=drift_ppm)
+    condition = clock.condition()
+    for _ in range(100):
+        deadline_ns = clock.now_ns() + 40 * MS + 7
+        with condition:
+            assert clock.wait_until(deadline_ns, condition) is False
+        assert deadline_ns <= clock.now_ns() <= deadline_ns + 1
+
+
+def test_a_skewed_clock_notifies_and_times_out_as_the_one_beneath():
+    clock = SkewedClock(SystemClock(), offset_s=5.0)
+    condition, woken = clock.condition(), []
+
+    def notify():
+        with condition:
+            condition.notify()
+
+    with condition:
+        thread = clock.thread(notify, "notify")
+        thread.start()
+        woken.append(clock.wait(condition))
+        woken.append(clock.wait(condition, 0.001))
+    thread.join()
+    assert woken == [True, False]

@@ -412,7 +412,7 @@ def test_extras_may_be_absent():
     ],
 )
 def test_a_wrong_array_is_refused_with_what_was_expected(value, expected):
-    action = Action(1, 2, 3, np.zeros(2, np.float32), -1.0, 4, 5, 6)
+    action = Action(1, 2, 3, np.zeros(2, np.float32), -1.0, 4, 5, 6, 7, 8, 9)
     with pytest.raises(MessageError, match=f"^Action.action: {expected}"):
         decode(changed(action, "action", value), Action, WITH_CAMERA)
 

@@ -26,7 +26,7 @@ from common.errors import MessageError, ServiceError
 from common.messages import SCHEMA_VERSION, Command, CommandReply, Finished, Status, TaskSpec
 from common.record import read_parts
 from common.run_service import run_service
-from common.run_settings import RunSettings, TransportSettings
+from common.run_settings import ClockSettings, RunSettings, TransportSettings
 from common.service import (
     DRAIN_TIMEOUT_S,
     GONE_AFTER_S,
@@ -658,6 +658,7 @@ def test_a_disk_that_refuses_is_counted_and_disturbs_nobody(scene, tmp_path, mon
 class TinyConfig:
     run: RunSettings
     transport: TransportSettings
+    clock: ClockSettings
 
 
 def never(service, config):
@@ -726,13 +727,14 @@ PROGRAM = """
 import sys
 from dataclasses import dataclass
 from common.errors import ServiceError
-from common.run_settings import RunSettings, TransportSettings
+from common.run_settings import ClockSettings, RunSettings, TransportSettings
 from common.run_service import run_service
 
 @dataclass(frozen=True)
 class TinyConfig:
     run: RunSettings
     transport: TransportSettings
+    clock: ClockSettings
 
 def serve(service, config):
     service.state = "running"

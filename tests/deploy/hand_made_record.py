@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from deploy.network.part import DeviceBytes, DirectionCounts, NetworkPart, Outage
+from services.robot_bridge.action_age import PARTS
 
 SECOND_NS = 1_000_000_000
 
@@ -47,6 +49,16 @@ def write_actions(run_dir: Path, times_s: list[tuple[float, float]]) -> None:
     rows = ["incarnation,answered_seq,published_ns,arrived_ns,late"]
     for seq, (published_s, arrived_s) in enumerate(times_s):
         rows.append(f"100,{seq},{round(published_s * SECOND_NS)},{round(arrived_s * SECOND_NS)},0")
+    (run_dir / "actions.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+
+def write_ages(run_dir: Path, rows_ms: Sequence[Sequence[float | None]]) -> None:
+    """Write ``actions.csv``: the parts of each action's age and the offset's bound, milliseconds; None is empty."""
+    columns = [f"{name}_us" for name in (*PARTS, "offset_bound")]
+    rows = [f"incarnation,answered_seq,published_ns,arrived_ns,late,{','.join(columns)}"]
+    for seq, parts in enumerate(rows_ms):
+        cells = ["" if part is None else str(round(part * 1000)) for part in parts]
+        rows.append(f"100,{seq},{seq * SECOND_NS},{seq * SECOND_NS + 1000},0,{','.join(cells)}")
     (run_dir / "actions.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 

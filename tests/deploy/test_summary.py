@@ -14,7 +14,7 @@ from deploy.run_record import read_record
 from deploy.summary import summarise
 from deploy.summary_text import summary_text
 from tests.common.ring_cases import Bridge, task_spec
-from tests.deploy.hand_made_record import network_part, write_actions, write_episodes, write_part
+from tests.deploy.hand_made_record import network_part, write_actions, write_ages, write_episodes, write_part
 
 FIELDS = [
     "task",
@@ -36,6 +36,7 @@ FIELDS = [
     "policy_version",
     "rollouts",
     "observation_to_action_ms",
+    "action_age_ms",
     "outages",
     "bytes_per_key",
     "wall_s",
@@ -176,6 +177,33 @@ def test_rollouts_and_what_was_dropped_between_them_add_up_over_restarts_of_repl
     values = summarise(read_record(tmp_path)).values
     assert values["rollouts"] == {"complete": 5, "dropped_transitions": 48}
     assert "5 rollouts, 48 transitions dropped" in summary_text(values)
+
+
+def test_the_medians_of_an_action_s_age_are_told_with_the_clocks_error(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    write_ages(tmp_path, [(1, 2, 3, 4, 5, 6, 7, 0.5), (1, 2, 13, 4, 5, 6, 7, 0.7), (1, 2, 4, 4, 5, 6, 7, 0.6)])
+    values = summarise(read_record(tmp_path)).values
+    assert values["action_age_ms"] == {
+        **{"camera": 1, "encode": 2, "uplink": 4, "queue": 4, "inference": 5, "downlink": 6, "apply": 7},
+        **{"age": 29, "offset_bound": 0.6},
+    }
+    assert "29.00 ms of age (p50): camera 1.00, encode 2.00, uplink 4.00" in summary_text(values)
+
+
+def test_a_clock_that_jumped_is_noted(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    write_part(tmp_path, "actor", 111, clock={"offset_s": 3.0, "jumps": 2})
+    write_part(tmp_path, "actor", 112, clock={"jumps": 1})
+    write_part(tmp_path, "replay", 131, clock={"jumps": 0})
+    notes = summarise(read_record(tmp_path)).values["notes"]
+    assert notes == ["actor: its clock and the bridge's jumped against each other (3 x)"]
+
+
+def test_in_simulated_time_an_action_has_no_age(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    replace(RUN, mode="in_process").write(tmp_path)
+    write_ages(tmp_path, [(1, 2, 3, 4, 5, 6, 7, 0.5)])
+    assert summarise(read_record(tmp_path)).values["action_age_ms"] is None
 
 
 def test_rows_that_stand_twice_in_the_ring_are_counted(tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from common.messages import (
     Array,
     ArrayMinibatch,
     Bounds,
+    ClockReading,
     Command,
     CommandReply,
     Credit,
@@ -107,10 +108,11 @@ def make_array_minibatch() -> ArrayMinibatch:
 
 EXAMPLES = (
     SPEC,
+    ClockReading(5, 6, 7),
     make_time_step(3),
     make_time_step(3, frames=encode_frames(make_time_step(3).frames, FrameEncoding.ZSTD)),
     make_time_step(3, frames=encode_frames(make_time_step(3).frames, FrameEncoding.JPEG444)),
-    Action(5, 6, 7, np.array([0.5, -1], np.float32), -1.25, 3, 8, 9),
+    Action(5, 6, 7, np.array([0.5, -1], np.float32), -1.25, 3, 8, 9, 10, -11, 12),
     make_experience(0),
     make_experience(3),
     Acknowledgement(5, 6, np.array([[6, 8], [10, 11]]), 2.5),
@@ -352,13 +354,16 @@ EXAMPLE = Action(
     log_probability=-1.25,
     policy_version=3,
     received_ns=5_000_000,
+    began_ns=5_100_000,
     sent_ns=5_400_000,
+    offset_ns=-3_000_000,
+    offset_bound_ns=200_000,
 )
 
 
 def test_the_example_is_the_payload_of_what_it_says():
     payload = b"".join(part for part, _ in example_lines())
-    assert len(payload) == 181
+    assert len(payload) == 231
     assert payload == encode(EXAMPLE)
     assert_same(program("client.py").decode(payload, "Action"), as_fields(EXAMPLE))
 

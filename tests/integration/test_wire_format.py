@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tomli_w
 
 from common.topics import SERVICES
 from deploy.wire_tables import DOCUMENT
@@ -19,6 +20,8 @@ from tests.docs.pages import programs, table_rows
 from tests.integration.ring_processes import ROOT, SMALL_AND_FAST, RingProcesses, options, start_all
 
 ENDS_WITHIN_S = 150.0
+OFFSET_S, DRIFT_PPM = 3.0, 50.0
+"""What the actor's clock is ahead by as it starts, and gains."""
 LISTENER = Path(__file__).with_name("wire_listener.py")
 RUN = """
 import runpy, sys
@@ -85,6 +88,12 @@ def addresses(configs: Path) -> tuple[str, str, dict[str, list[str]]]:
     return run["id"], run.get("robot", "robot0"), endpoints
 
 
+def skew(config: Path) -> None:
+    """Give a service another computer's clock."""
+    tables = tomllib.loads(config.read_text(encoding="utf-8"))
+    config.write_text(tomli_w.dumps({**tables, "clock": {"offset_s": OFFSET_S, "drift_ppm": DRIFT_PPM}}))
+
+
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What the three programs printed during one run, and its summary."""
@@ -100,6 +109,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         "algorithm.replay_ratio=0.25",
     )
     with RingProcesses(folder, "noise_frames", "--steps", "1000000", *settings) as ring:
+        skew(folder / "config" / "actor.toml")
         run, robot, endpoints = addresses(folder / "config")
         real_time = [endpoints[service][0] for service in SERVICES]
         everything = [endpoint for pair in endpoints.values() for endpoint in pair]
@@ -124,6 +134,13 @@ def test_a_listener_made_from_the_document_finds_everything_as_it_says(live: dic
     for what, count in found["compared"].items():
         assert count >= 20, f"{what}: {found['compared']}"
     assert found["frames"] > found["heard"]["timestep"], "with one or two new frames each"
+
+
+def test_the_actor_finds_out_that_its_clock_is_another_one(live: dict[str, Any]) -> None:
+    offset_s, bound_s = (ns / 1e9 for ns in live["found"]["offset"])
+    drifted_s = ENDS_WITHIN_S * DRIFT_PPM / 1e6  # at most, as it has not run for longer
+    assert -OFFSET_S - drifted_s - bound_s <= offset_s <= -OFFSET_S + bound_s
+    assert bound_s < 0.1
 
 
 def test_nothing_of_ours_was_imported(live: dict[str, Any]) -> None:

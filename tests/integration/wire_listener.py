@@ -249,6 +249,25 @@ def check_actions(steps, actions, spec):
     return compared
 
 
+def check_times(steps, actions):
+    """Times are in order on each clock and, by the offset, on both; return how often, and the newest offset."""
+    for action in actions.values():
+        assert 0 < action["received_ns"] <= action["began_ns"] <= action["sent_ns"]
+    compared = 0
+    for step in steps.values():
+        action = actions.get(step["answered_seq"])
+        observed = steps.get(step["answered_seq"])
+        if action is None or observed is None or action["offset_bound_ns"] < 0:
+            continue
+        compared += 1
+        bound = action["offset_bound_ns"]
+        received, sent = (action[name] + action["offset_ns"] for name in ("received_ns", "sent_ns"))
+        assert observed["published_ns"] <= received + bound
+        assert sent - bound <= step["action_applied_ns"]
+    newest = actions[max(actions)]
+    return compared, newest["offset_ns"], newest["offset_bound_ns"]
+
+
 def check_experiences(experiences, steps, actions):
     """Return how many experiences were compared with their time steps, and how many with their actions."""
     compared = answered = 0
@@ -381,6 +400,9 @@ def main(document_file, run, robot, *endpoints):
         listener.sizes |= dict(zip("HWC", spec["frame_shape"].tolist(), strict=True))
         tables.check("TaskSpec", spec, dict(listener.sizes))
         listener.until(listener.enough, "enough of everything")
+        reading = client.decode(client.ask(session, f"{root}/clock"), "ClockReading")
+        tables.check("ClockReading", reading, {})
+        assert reading["received_ns"] <= reading["answered_ns"]
         cached = client.decode(client.ask(session, f"{root}/policy/@adv/pub/**?_max=1;_anyke"), "PolicyWeights")
         refusals = {}
         for service in SERVICES:
@@ -420,6 +442,8 @@ def main(document_file, run, robot, *endpoints):
     assert finished[0] >= max(steps) + 1
     stacks = rebuilt_stacks(steps, spec["frame_stack"], observation)
     experience_steps, experience_actions = check_experiences(experiences, steps, actions)
+    assert reading["incarnation"] == incarnations["robot_bridge"]
+    times, *offset = check_times(steps, actions)
     densities = check_log_probabilities(steps, stacks, actions, heard["policy"], spec, policy)
     assert set(policy.parameters(cached)) == set(policy.parameters(heard["policy"][-1]))
     modules = [str(getattr(module, "__file__", None)) for module in sys.modules.values()]
@@ -432,6 +456,7 @@ def main(document_file, run, robot, *endpoints):
         "compared": {
             "consecutive time steps": check_time_steps(steps, spec),
             "time steps with actions": check_actions(steps, actions, spec),
+            "times on two clocks": times,
             "experiences with time steps": experience_steps,
             "experiences with actions": experience_actions,
             "log-probabilities, initial policy": densities["initial"],
@@ -439,6 +464,7 @@ def main(document_file, run, robot, *endpoints):
             "minibatch transitions": check_minibatches(heard["minibatch/arrays"], steps, stacks),
         },
         "cached_policy": cached["version"],
+        "offset": offset,
         "refusals": refusals,
         "counters": {
             service: sorted({name for s in heard["status"] if s["service"] == service for name in s["counters"]})

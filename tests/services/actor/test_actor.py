@@ -30,7 +30,27 @@ def test_an_answer_says_whom_and_what_it_answers(tmp_path):
     assert (action.actor_incarnation, action.incarnation, action.answered_seq) == (ACTOR, BRIDGE, 12)
     np.testing.assert_allclose(action.action, [0.12, 0.12])
     assert (action.policy_version, action.log_probability) == (0, 0.0)
-    assert (action.received_ns, action.sent_ns) == (7_000, 7_000)
+    assert (action.received_ns, action.began_ns, action.sent_ns) == (7_000, 7_000, 7_000)
+    assert (action.offset_ns, action.offset_bound_ns) == (0, -1), "nobody has told the actor the bridge's time"
+
+
+def test_an_answer_tells_when_it_came_began_and_was_computed_and_what_the_bridge_s_clock_shows(tmp_path, monkeypatch):
+    clock = FakeClock(7_000)
+    scene = Scene(tmp_path, clock=clock)
+    act = scene.policy.act
+
+    def act_slowly(*arguments):
+        clock.advance(0.005)
+        return act(*arguments)
+
+    monkeypatch.setattr(scene.policy, "act", act_slowly)
+    monkeypatch.setattr(scene.service, "bridge_offset", lambda now_ns: (now_ns - 10_000_000, 42))
+    scene.peer.send(topics.TIME_STEP, scene.time_step(12))
+    clock.advance(0.002)  # until the actor's loop gets to it
+    scene.actor.take_time_steps()
+    (action,) = scene.actions
+    assert (action.received_ns, action.began_ns, action.sent_ns) == (7_000, 2_007_000, 7_007_000)
+    assert (action.offset_ns, action.offset_bound_ns) == (-2_993_000, 42)
 
 
 def test_an_observation_is_stack_proprioception_and_the_action_in_force(tmp_path):

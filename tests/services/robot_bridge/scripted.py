@@ -145,6 +145,8 @@ class Scene:
         self.announced = decode(self.actor.transport.query(topics.SPEC), TaskSpec)
         self.answers = answers if callable(answers) else lambda time_step: answers
         self.probe_answer = 0.0
+        self.actor_times = lambda: (0, 0, 0, 0, -1)
+        """What answers say of the actor's clock: received, began, sent, offset and its bound; -1: not known."""
         self.time_steps: list[TimeStep] = []
         self.published_s: list[float] = []
         """When each of ``time_steps`` was published."""
@@ -160,7 +162,9 @@ class Scene:
     def answer(self, seq, action=None, *, incarnation=BRIDGE, actor_incarnation=ACTOR) -> None:
         """Let an answer to TimeStep ``seq`` arrive now."""
         action = action_of(seq) if action is None else np.array(action, np.float32)
-        self.actor.send(topics.ACTION, Action(actor_incarnation, incarnation, seq, action, -1.0, 3, 0, 0))
+        self.actor.send(
+            topics.ACTION, Action(actor_incarnation, incarnation, seq, action, -1.0, 3, *self.actor_times())
+        )
 
     def command(self, name):
         """Command the bridge."""

@@ -162,7 +162,7 @@ def test_an_unknown_command_is_refused_with_the_known_ones(tmp_path):
 )
 def test_an_action_that_is_no_action_is_dropped_and_counted(tmp_path, action):
     scene = Scene(tmp_path, answers=None, steps=1)
-    bad = Action(ACTOR, BRIDGE, 1, action, -1.0, 0, 0, 0)
+    bad = Action(ACTOR, BRIDGE, 1, action, -1.0, 0, *scene.actor_times())
     scene.clock.at(0.01, lambda: scene.actor.send(topics.ACTION, bad))
     scene.run()
     assert sources(scene) == [ActionSource.ZERO]
