@@ -30,7 +30,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 
 
 class Elsewhere:
-    """A folder outside the repository with the document, its programs, and the three packages they need."""
+    """A folder outside the repository with the document, its programs, and the four packages they need."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._packages = folder / "elsewhere", folder / "packages"
@@ -41,7 +41,7 @@ class Elsewhere:
         files = {DOCUMENT.name: document, LISTENER.name: LISTENER.read_text(encoding="utf-8"), **programs(document)}
         for name, text in files.items():
             (self._folder / name).write_text(text, encoding="utf-8")
-        for package in ("zenoh", "msgpack", "numpy"):
+        for package in ("zenoh", "msgpack", "numpy", "xxhash"):
             (installed,) = importlib.util.find_spec(package).submodule_search_locations
             for found in (Path(installed), Path(f"{installed}.libs")):
                 if found.exists():
