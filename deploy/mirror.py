@@ -99,14 +99,13 @@ class Mirror:
                 return content
 
 
-def write_ring_counts(run_dir: Path, duplicated: int, last_published_ns: int) -> None:
+def write_ring_counts(run_dir: Path, rows: int, duplicated: int, last_published_ns: int) -> None:
     """Leave what the other computer's summary wants to know of the ring."""
-    write_atomically(
-        run_dir / RING_COUNTS, json.dumps({"duplicated": duplicated, "last_published_ns": last_published_ns}) + "\n"
-    )
+    counts = {"rows": rows, "duplicated": duplicated, "last_published_ns": last_published_ns}
+    write_atomically(run_dir / RING_COUNTS, json.dumps(counts) + "\n")
 
 
 def read_ring_counts(path: Path) -> dict[str, Any]:
     """Return what :func:`write_ring_counts` wrote."""
     counts = json.loads(path.read_text(encoding="utf-8"))
-    return {name: int(counts[name]) for name in ("duplicated", "last_published_ns")}
+    return {name: int(counts[name]) for name in ("rows", "duplicated", "last_published_ns")}

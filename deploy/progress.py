@@ -23,6 +23,8 @@ class Progress:
     steps: int = 0
     steps_total: int = 0
     left_s: float | None = None
+    waits_for: str | None = None
+    """What the robot stands still for."""
     steps_per_goal: float | None = None
     """Over the last 1000 steps."""
     recent_length: float | None = None
@@ -69,6 +71,7 @@ class ProgressReader:
             steps=steps,
             steps_total=self._steps_total,
             left_s=self._left_s(steps),
+            waits_for=(newest[ROBOT_BRIDGE] or {}).get("waits_for"),
             steps_per_goal=steps_per_goal(episodes, steps) if has_goal else None,
             recent_length=sum(episode.length for episode in recent) / len(recent) if recent else None,
             last_return=parts.latest(ROBOT_BRIDGE, "last_return"),
@@ -98,7 +101,9 @@ def progress_line(progress: Progress) -> str:
         return "starting: " + ", ".join(f"{service} {state}" for service, state in progress.states.items())
     share = f"{100 * progress.steps / progress.steps_total:.0f} %" if progress.steps_total else "?"
     head = f"{progress.steps}/{progress.steps_total} {share}"
-    if progress.left_s is not None and progress.steps < progress.steps_total:
+    if progress.waits_for is not None:
+        head += f" the robot waits for {progress.waits_for}"
+    elif progress.left_s is not None and progress.steps < progress.steps_total:
         head += f" ETA {_minutes(progress.left_s)}"
     items = [head]
     if progress.steps_per_goal is not None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from common.errors import ConfigError, RelodError, RingError
 from common.record import settle_parts
+from common.topics import ROBOT_BRIDGE
 from deploy.action_age import ActionAges
 from deploy.actions import ArrivedActions
 from deploy.episodes import Episode, EpisodeTable
@@ -26,6 +27,8 @@ RING = "ring"
 class RingContent:
     """What the summary wants to know of the experience ring."""
 
+    rows: int
+    """Rows that were ever written: what stands in the ring now, and what it has replaced."""
     duplicated: int
     """Rows whose time step stands in an earlier row."""
     last_published_ns: int
@@ -78,9 +81,10 @@ def read_record(*run_dirs: Path) -> Record:
     unreadable = table.unreadable + (actions.unreadable if actions else 0)
     if unreadable:
         warnings.append(f"{unreadable} rows of episodes.csv and actions.csv could not be read")
+    run = attempt(lambda: RunFile.read(_folder_with(run_dirs, "run.toml")))
     return Record(
-        parts=RunParts.read(*folders),
-        run=attempt(lambda: RunFile.read(_folder_with(run_dirs, "run.toml"))),
+        parts=_parts_of_one_run(RunParts.read(*folders), run, warnings),
+        run=run,
         episodes=table.episodes,
         actions=actions,
         ages=_read_ages(_folder_with(folders, "actions.csv")),
@@ -106,6 +110,21 @@ def _check_one_run(run_dirs: Sequence[Path]) -> None:
     if len(ids) > 1:
         told = ", ".join(f"{run_dir} is of run {run_id}" for run_id, run_dir in ids.items())
         raise ConfigError(f"expected the folders of one run; {told}")
+
+
+def _parts_of_one_run(parts: RunParts, run: RunFile | None, warnings: list[str]) -> RunParts:
+    """Without the parts of other runs, which somebody has copied into the folder."""
+    bridge = parts.newest(ROBOT_BRIDGE)
+    expected = run.id if run else bridge.get("run") if bridge else None
+    own = []
+    for part in parts.parts:
+        name = part.get("run", expected)
+        if expected is None or name == expected:
+            own.append(part)
+        else:
+            file = f"parts/{part['service']}-{part['incarnation']}.json"
+            warnings.append(f"{file} is of run {name!r}, expected {expected!r}: left out")
+    return RunParts(tuple(own))
 
 
 def _folder_with(folders: Sequence[Path], name: str) -> Path:
@@ -140,7 +159,7 @@ def read_ring(path: Path) -> RingContent:
         reader.close()
     identities = rows[["incarnation", "seq"]]
     newest_ns = int(rows["published_ns"].max()) if len(rows) else 0
-    return RingContent(len(rows) - len(np.unique(identities)), newest_ns)
+    return RingContent(end, len(rows) - len(np.unique(identities)), newest_ns)
 
 
 def _read_ages(run_dir: Path) -> ActionAges | None:

@@ -167,7 +167,7 @@ def _leave_ring_counts(run_dir: Path) -> None:
     """What killed services have left is settled, and the ring counted: from now on this side's files are final."""
     record = read_record(run_dir)
     if (run_dir / RING).exists() and record.ring is not None:
-        write_ring_counts(run_dir, record.ring.duplicated, record.ring.last_published_ns)
+        write_ring_counts(run_dir, **vars(record.ring))
 
 
 def _exchange_records(

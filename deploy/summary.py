@@ -52,9 +52,16 @@ def summarise(record: Record) -> Summary:
     run = record.run
     steps = _count(parts.latest(ROBOT_BRIDGE, "steps"))
     has_goal = run_parts.newest_detail(parts, ROBOT_BRIDGE, "has_goal")
-    produced, persisted = run_parts.produced(parts), run_parts.persisted(parts)
+    produced, persisted = run_parts.produced(parts), _persisted(record)
     if persisted is None:
         warnings.append("replay left no count of what it has persisted")
+    learner = parts.newest(LEARNER)
+    if learner is not None and "updates" not in learner.get("counters", {}):
+        notes.append("updates is null: the learner was still starting")
+    episodes = _count(parts.latest(ROBOT_BRIDGE, "episodes"))
+    missing_episodes = max(0, (episodes or 0) - len(record.episodes))
+    if missing_episodes:
+        notes.append(f"episodes.csv holds {len(record.episodes)} of the {episodes} completed episodes")
     for service, jumps in run_parts.clock_jumps(parts).items():
         notes.append(f"{service}: its clock and the bridge's jumped against each other ({jumps} x)")
     values = {
@@ -65,8 +72,8 @@ def summarise(record: Record) -> Summary:
         "seed": run.seed if run else run_parts.newest_detail(parts, ROBOT_BRIDGE, "seed"),
         "steps": steps,
         "acted_steps": _count(parts.latest(ROBOT_BRIDGE, "acted_steps")),
-        "episodes": _count(parts.latest(ROBOT_BRIDGE, "episodes")),
-        "steps_per_goal_last_1000": _steps_per_goal(record.episodes, steps, has_goal, notes),
+        "episodes": episodes,
+        "steps_per_goal_last_1000": _steps_per_goal(record.episodes, steps, has_goal, missing_episodes, notes),
         **{
             name: _count(parts.total(ROBOT_BRIDGE, name))
             for name in ("cycles", "overruns", "overruns_after_1000", "late_actions")
@@ -113,15 +120,25 @@ def write_curve(run_dir: Path, summary: Summary) -> Path:
 
 
 def _steps_per_goal(
-    episodes: Sequence[Episode], steps: int | None, has_goal: bool | None, notes: list[str]
+    episodes: Sequence[Episode], steps: int | None, has_goal: bool | None, missing_episodes: int, notes: list[str]
 ) -> float | None:
     if not has_goal or not steps:
         return None
     value = steps_per_goal(episodes, steps)
+    if value is None and missing_episodes:
+        return None  # a note says so already
     if value is None:
         notes.append("steps_per_goal_last_1000 is null: no goal was reached in the last 1000 steps")
         return None
     return round(value, 3)
+
+
+def _persisted(record: Record) -> int | None:
+    """Distinct TimeSteps that replay has stored: by its own last word, or of one that died before it, by its ring."""
+    replay, counted = record.parts.newest(REPLAY), run_parts.persisted(record.parts)
+    if record.ring is None or replay is None or replay.get("state") == "stopped":
+        return counted
+    return max(counted or 0, record.ring.rows - record.ring.duplicated)
 
 
 def _rollouts(parts: RunParts) -> dict[str, int | None] | None:

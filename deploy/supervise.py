@@ -72,6 +72,11 @@ class Supervisor:
         """True while any service runs, whoever has started it."""
         return any(child.alive for child in self.children.values())
 
+    @property
+    def still_running(self) -> list[str]:
+        """Services that run, whoever has started them."""
+        return [child.name for child in self.children.values() if child.alive]
+
     def overdue(self, limit_s: float) -> bool:
         """True if the bridge ended well more than ``limit_s`` ago and somebody still runs."""
         bridge = self.children.get(ROBOT_BRIDGE)
@@ -144,9 +149,16 @@ class Supervisor:
         if code > 0 and not self._run_has_begun():
             self.cannot_start = True
             lines += ["  it could not start, so the run ends"]
-        else:
+        elif self._run_goes_on():
             lines += _how_to_return(child)
+        else:
+            lines += ["  the run is over: started again, it would find nobody"]
         self._report("\n".join(lines))
+
+    def _run_goes_on(self) -> bool:
+        """False once the bridge has ended well; one that died may return."""
+        bridge = self.children.get(ROBOT_BRIDGE)
+        return bridge is None or bridge.alive or not bridge.ended_well
 
     def _note_early_end(self, child: Child) -> None:
         """Somebody has asked a service to stop, which then ends with code 0, and the run goes on without it."""

@@ -96,7 +96,11 @@ def watch(
                 next_progress_s = time.monotonic() + _PROGRESS_S
                 console.status(progress_line(reader.read()))
             if supervisor.overdue(OVERTIME_S):
-                console.error(f"the bridge ended {OVERTIME_S:.0f} s ago, and some have not heard of it")
+                end = EarlyEnd(
+                    f"{' and '.join(supervisor.still_running)} did not end within {OVERTIME_S:.0f} s after the "
+                    "robot_bridge: the network has kept from them that the run is over, or they had not yet begun"
+                )
+                console.error(end.reason)
                 break
             time.sleep(_POLL_S)
         if not stop.asked:

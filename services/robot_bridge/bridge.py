@@ -81,6 +81,7 @@ class RobotBridge:
         self._in_force = self._no_command()
         self._world_ns = self._clock.now_ns()
         self._told_ns = self._clock.now_ns()
+        self._waits_for: str | None = None
         service.counters = self.counters
         service.details = self.details
         service.serve_commands(
@@ -326,9 +327,12 @@ class RobotBridge:
         self._task.stop()
         waiting = [peer for peer in PEERS if self._service.peer_state(peer) not in ("running", "draining")]
         if waiting or self._watchdog.latched:
-            self._tell_waiting(waiting)
+            reason = self._watchdog.latched or " and ".join(waiting)
+            self._waits_for = "resume" if reason in ("pause", "e_stop") else reason
+            self._tell_waiting()
             self._service.pause(0.05)
             return
+        self._waits_for = None
         logger.info("actor and replay are there: asking for a first answer")
         # An attempt of a single TimeStep, of which no transition comes: no step is counted and the robot stands still.
         self._probing = True
@@ -343,11 +347,10 @@ class RobotBridge:
         self._probing = False
         self._keeper.start(self._clock.now_ns())
 
-    def _tell_waiting(self, waiting: list[str]) -> None:
+    def _tell_waiting(self) -> None:
         if self._clock.now_ns() - self._told_ns > WAITING_TOLD_NS:
             self._told_ns = self._clock.now_ns()
-            reason = self._watchdog.latched or " and ".join(waiting)
-            logger.warning("the robot waits for: %s", {"pause": "resume", "e_stop": "resume"}.get(reason, reason))
+            logger.warning("the robot waits for: %s", self._waits_for)
 
     def _finish(self, reason: str) -> None:
         finished = encode(Finished(self._service.incarnation, self.counts.produced, reason))
@@ -421,5 +424,6 @@ class RobotBridge:
             "seed": self._service.run.seed,
             "steps_total": self._settings.steps,
             "latched": self._watchdog.latched,
+            "waits_for": self._waits_for,
             "surviving_counts": self._surviving_counts.description() if self._surviving_counts else None,
         }

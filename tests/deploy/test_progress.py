@@ -40,5 +40,10 @@ def test_a_service_that_does_not_run_is_named() -> None:
     assert progress_line(progress).endswith("lost 0 | actor stopped")
 
 
+def test_a_robot_that_waits_says_for_whom(tmp_path: Path) -> None:
+    write_part(tmp_path, "robot_bridge", 1, state="running", counters={"steps": 30}, waits_for="actor")
+    assert progress_line(ProgressReader(tmp_path, 100).read()).startswith("30/100 30 % the robot waits for actor | ")
+
+
 def test_a_finished_run_has_no_time_left() -> None:
     assert "ETA" not in progress_line(Progress(RUNNING, steps=20, steps_total=20, left_s=0.0))

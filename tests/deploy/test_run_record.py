@@ -16,7 +16,7 @@ from tests.common.ring_cases import Bridge, task_spec
 from tests.deploy.hand_made_record import write_actions, write_episodes, write_part
 
 RUN = RunFile(
-    id="run1",
+    id="test",
     mode="remote_local",
     task="dot_reacher",
     algorithm="sac",
@@ -76,7 +76,7 @@ def test_one_side_alone_lacks_the_other_and_says_so(tmp_path: Path) -> None:
 def test_the_copy_of_the_other_side_s_files_is_as_good_as_its_folder(tmp_path: Path) -> None:
     local, remote = write_sides(tmp_path)
     both = summarise(read_record(local, remote)).values
-    write_ring_counts(remote, 0, 5)
+    write_ring_counts(remote, 7, 0, 5)
     for name in shared_files(remote):
         copy = local / "hosts" / "remote" / name
         copy.parent.mkdir(parents=True, exist_ok=True)
@@ -99,7 +99,7 @@ def test_folders_of_two_runs_are_refused(tmp_path: Path, capsys: pytest.CaptureF
     replace(RUN, id="run2").write(remote)
     assert main([str(local), str(remote)]) == 1
     assert (
-        f"expected the folders of one run; {local} is of run run1, {remote} is of run run2" in capsys.readouterr().err
+        f"expected the folders of one run; {local} is of run test, {remote} is of run run2" in capsys.readouterr().err
     )
 
 

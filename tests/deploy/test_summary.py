@@ -46,7 +46,7 @@ FIELDS = [
 ]
 BRIDGE = {"task": "dot_reacher", "has_goal": True, "seed": 4}
 RUN = RunFile(
-    id="run1",
+    id="test",
     mode="remote_only",
     task="dot_reacher",
     algorithm="sac",
@@ -71,7 +71,7 @@ def write_run(run_dir: Path) -> None:
         counters={
             "steps": 1000,
             "acted_steps": 900,
-            "episodes": 20,
+            "episodes": 2,
             "cycles": 1000,
             "overruns": 5,
             "overruns_after_1000": 0,
@@ -90,7 +90,7 @@ def write_run(run_dir: Path) -> None:
         counters={
             "steps": 3000,
             "acted_steps": 2500,
-            "episodes": 60,
+            "episodes": 5,
             "cycles": 2000,
             "overruns": 2,
             "overruns_after_1000": 1,
@@ -136,7 +136,7 @@ def test_the_summary_of_a_run_with_several_incarnations(tmp_path: Path) -> None:
         "seed": 4,
         "steps": 3000,
         "acted_steps": 2500,
-        "episodes": 60,
+        "episodes": 5,
         "steps_per_goal_last_1000": 250.0,  # four of the five goals are in the last 1000 of 3000 steps
         "cycles": 3000,
         "overruns": 7,
@@ -262,6 +262,41 @@ def test_steps_per_goal_are_null_without_a_goal_and_noted_where_none_was_reached
     values = summarise(read_record(tmp_path)).values
     assert values["steps_per_goal_last_1000"] is None
     assert "no goal was reached" in values["notes"][0]
+
+
+def test_episodes_that_are_missing_in_the_table_are_noted(tmp_path: Path) -> None:
+    write_part(tmp_path, "robot_bridge", 100, counters={"steps": 5000, "episodes": 3}, **BRIDGE)
+    values = summarise(read_record(tmp_path)).values
+    assert values["steps_per_goal_last_1000"] is None
+    assert values["notes"] == ["episodes.csv holds 0 of the 3 completed episodes"]
+
+
+def test_parts_of_another_run_are_left_out_and_named(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    write_part(tmp_path, "robot_bridge", 60_000_000_000, run="another", counters={"steps": 9, "produced": 999})
+    result = summarise(read_record(tmp_path))
+    assert result.values["experience"]["produced"] == 305
+    assert "parts/robot_bridge-60000000000.json is of run 'another', expected 'test': left out" in result.warnings
+
+
+def test_of_a_replay_that_was_killed_the_ring_tells_what_it_has_stored(tmp_path: Path) -> None:
+    bridge = Bridge(incarnation=7, camera=False)
+    ring = RingWriter.create_or_reopen(tmp_path / "ring", task_spec(camera=False), 3)
+    for _ in range(5):
+        ring.append(bridge.start())
+    ring.close()
+    write_part(tmp_path, "robot_bridge", 7, counters={"produced": 6}, **BRIDGE)
+    write_part(tmp_path, "replay", 8, state="running", persisted={"7": 2})
+    experience = summarise(read_record(tmp_path)).values["experience"]
+    assert (experience["persisted"], experience["lost"]) == (5, 1)
+
+
+def test_a_learner_that_had_not_begun_is_noted(tmp_path: Path) -> None:
+    write_part(tmp_path, "robot_bridge", 100, **BRIDGE)
+    write_part(tmp_path, "learner", 150, counters={})
+    values = summarise(read_record(tmp_path)).values
+    assert values["updates"] is None
+    assert values["notes"] == ["updates is null: the learner was still starting"]
 
 
 def test_a_run_on_one_host_has_no_outages_and_no_link(tmp_path: Path) -> None:

@@ -104,6 +104,15 @@ def test_a_service_that_fails_is_reported_with_its_reason_and_its_command(
     assert all(supervisor.children[name].alive for name in ("robot_bridge", "actor", "learner"))
 
 
+def test_after_the_bridge_s_end_nobody_is_to_be_started_again(start: Start, reports: Reports) -> None:
+    supervisor = start(robot_bridge="done", learner="deaf")
+    check_until(supervisor, lambda: supervisor.children["robot_bridge"].ended_well, "the bridge has not ended")
+    supervisor.children["learner"].signal(signal.SIGKILL)
+    check_until(supervisor, lambda: reports, "nothing was reported")
+    assert "the run is over: started again, it would find nobody" in reports.text()
+    assert "start it again" not in reports.text()
+
+
 def test_without_a_part_s_word_the_console_s_last_lines_are_the_reason(start: Start, reports: Reports) -> None:
     supervisor = start(actor="crash")
     check_until(supervisor, lambda: reports, "nothing was reported")
