@@ -10,6 +10,12 @@ from common.errors import ConfigError
 from common.run_settings import AlgorithmSettings, RunSettings, TransportSettings
 
 
+def check_device_name(device: str) -> None:
+    """Raise :class:`~common.errors.ConfigError` if ``device`` cannot be one; whether it is there, nobody knows yet."""
+    if not re.fullmatch(r"cpu|cuda(:\d{1,2})?", device):
+        raise ConfigError(f"device = {device!r}: expected cpu, cuda or cuda:N, N a GPU's number")
+
+
 @dataclass(frozen=True)
 class LearnerSettings:
     """``[learner]``: policy updates."""
@@ -33,8 +39,7 @@ class LearnerSettings:
     """Period of the checkpoint that a restarted learner goes on from, seconds."""
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"cpu|cuda(:\d{1,2})?", self.device):
-            raise ConfigError(f"device = {self.device!r}: expected cpu, cuda or cuda:N, N a GPU's number")
+        check_device_name(self.device)
 
     @property
     def frames_on_device(self) -> bool:
