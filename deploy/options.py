@@ -14,6 +14,7 @@ from typing import Any
 from common.algorithms import ALGORITHMS
 from common.config import read_toml
 from common.errors import ConfigError
+from deploy.hosts import host_names, load_host
 from deploy.network import PRESETS, NetworkConditions, load_network, parse_network
 from deploy.network.conditions import DIRECTIONS
 from deploy.placement import Placement, load_placement, mode_names
@@ -21,6 +22,9 @@ from deploy.plan import RunRequest, split_overrides
 
 NO_NETWORK = "none"
 """Name of the network of a run on one host."""
+
+HOST_BUDGET_HELP = f"what the learner's computer can do: {', '.join(host_names())}, or a TOML file with a table [host]"
+"""Of the option that ``experiments.train`` has too."""
 
 _DESCRIPTION = """\
 Start the four services of a run, watch them, and summarise what came of it.
@@ -72,6 +76,7 @@ def parse_options(arguments: Sequence[str] | None = None) -> LaunchOptions:
         seed=options.seed,
         steps=options.steps,
         pacing=options.pacing,
+        learner_host=load_host(options.host_budget) if options.host_budget else None,
         overrides=tuple(for_services),
     )
     write_config = options.write_config.absolute() if options.write_config else None
@@ -147,6 +152,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="PRESET|FILE",
         help=f"network between the hosts: {', '.join(PRESETS)}, or a TOML file with a table [network]",
     )
+    parser.add_argument("--host-budget", metavar="HOST|FILE", help=HOST_BUDGET_HELP)
     parser.add_argument("--run-dir", type=Path, metavar="DIR", help="folder of the run's record (default: in runs/)")
     parser.add_argument(
         "--set",

@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from common.algorithms import ALGORITHMS
+from common.algorithms.presets import setting_names
 from common.config import Tables, build_config, parse_override, section_names
 from common.errors import ConfigError
 from common.topics import ACTOR, LEARNER, REPLAY, ROBOT_BRIDGE, SERVICES, Lane
+from deploy.hosts import Host
 from deploy.network import Crossing, NetworkConditions, NetworkLink
 from deploy.network.conditions import direction_from
 from deploy.placement import Placement
@@ -66,6 +68,8 @@ class RunRequest:
     seed: int | None = None
     steps: int | None = None
     pacing: str | None = None
+    learner_host: Host | None = None
+    """The computer that the learner's computer stands for; None: itself."""
     overrides: tuple[str, ...] = ()
     """``section.key=value``, for the services; see :func:`split_overrides`."""
 
@@ -155,7 +159,8 @@ def _tables(
 ) -> Tables:
     placement = request.placement
     access = "map" if placement.together(REPLAY, LEARNER) else "arrays"
-    algorithm = {"name": request.algorithm}
+    host = request.learner_host
+    algorithm = {"name": request.algorithm, **_memory_and_rate(request)}
     tables: Tables = {
         "run": _without_none({"id": request.run_id, "directory": str(request.run_dir), "seed": request.seed}),
         "transport": _transport_table(service, placement, ports, network_link, conditions),
@@ -170,13 +175,26 @@ def _tables(
         case "actor":
             tables["algorithm"] = algorithm
             tables["actor"] = _resend_pace(placement, ACTOR, REPLAY, conditions)
+            if host and placement.together(ACTOR, LEARNER):
+                tables["actor"]["min_inference_s"] = host.inference_s
         case "replay":
             tables["algorithm"] = algorithm
             tables["replay"] = {"access": access}
         case "learner":
             tables["algorithm"] = algorithm
             tables["learner"] = {"access": access}
+            if host:
+                tables["learner"] |= {"device": host.device, "threads": host.threads}
     return tables
+
+
+def _memory_and_rate(request: RunRequest) -> dict[str, Any]:
+    """What the learner's computer leaves of an algorithm that replays experience."""
+    host = request.learner_host
+    if host is None:
+        return {}
+    values = {"replay_ratio": host.updates_per_step, "replay_capacity": host.replay_capacity}
+    return {key: value for key, value in values.items() if key in setting_names(request.algorithm)}
 
 
 def _transport_table(

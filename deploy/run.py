@@ -221,6 +221,7 @@ def _run_file(options: LaunchOptions, configurations: Mapping[str, Any], network
         placement=dict(options.request.placement.host),
         conditions=options.conditions.to_table() if options.conditions and part else {},
         versions=versions(),
+        host_budget=options.request.learner_host.name if options.request.learner_host else "",
     )
 
 

@@ -55,6 +55,8 @@ class RunFile:
     conditions: dict[str, Any] = field(default_factory=dict)
     """The network's ``[network]`` table; empty if nothing crosses one."""
     versions: dict[str, str] = field(default_factory=dict)
+    host_budget: str = ""
+    """Name of the computer that the learner's stands for; empty: itself."""
 
     def write(self, run_dir: Path) -> None:
         """Write ``run_dir/run.toml``."""

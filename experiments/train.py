@@ -31,8 +31,9 @@ from common.record import write_atomically
 from common.service import Service
 from common.topics import LEARNER, ROBOT_BRIDGE, SERVICES
 from deploy.console import Console
+from deploy.hosts import load_host
 from deploy.network import NoLink
-from deploy.options import NO_NETWORK, default_run_name, make_run_id
+from deploy.options import HOST_BUDGET_HELP, NO_NETWORK, default_run_name, make_run_id
 from deploy.placement import load_placement
 from deploy.plan import PORTS, PortMap, RunRequest, plan_run
 from deploy.progress import ProgressReader, progress_line
@@ -65,6 +66,8 @@ class Training:
     """Action cycles, resets included; None: the bridge's default."""
     overrides: tuple[str, ...] = ()
     """``section.key=value``, as for ``deploy.launch``."""
+    host_budget: str | None = None
+    """Name or file of the computer that the learner's stands for; None: this one."""
 
 
 def train(training: Training, console: Console | None = None, stop: StopSignals | None = None) -> dict[str, Any]:
@@ -221,6 +224,7 @@ def _configurations(training: Training) -> dict[str, Any]:
         seed=training.seed,
         steps=training.steps,
         pacing="lockstep",
+        learner_host=load_host(training.host_budget) if training.host_budget else None,
         # There is nobody here that a learner could keep from running.
         overrides=("learner.nice=0", *training.overrides),
     )
@@ -246,6 +250,7 @@ def _write_configurations(training: Training, configurations: Mapping[str, Any])
         backend=NO_NETWORK,
         placement=dict.fromkeys(SERVICES, "local"),
         versions=versions(),
+        host_budget=load_host(training.host_budget).name if training.host_budget else "",
     ).write(training.run_dir)
 
 
@@ -275,6 +280,7 @@ def _parse(arguments: Sequence[str] | None) -> Training:
     parser.add_argument("--algorithm", default="sac", help=f"one of {', '.join(ALGORITHMS)} (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of everything random (default: 0)")
     parser.add_argument("--steps", type=int, metavar="N", help="action cycles of the run, resets included")
+    parser.add_argument("--host-budget", metavar="HOST|FILE", help=HOST_BUDGET_HELP)
     parser.add_argument("--run-dir", type=Path, metavar="DIR", help="folder of the run's record (default: in runs/)")
     parser.add_argument(
         "--set",
@@ -285,7 +291,15 @@ def _parse(arguments: Sequence[str] | None) -> Training:
     )
     options = parser.parse_args(arguments)
     run_dir = options.run_dir or Path("runs") / default_run_name(IN_PROCESS, options.task, options.seed, datetime.now())
-    return Training(options.task, run_dir, options.algorithm, options.seed, options.steps, tuple(options.set))
+    return Training(
+        options.task,
+        run_dir,
+        options.algorithm,
+        options.seed,
+        options.steps,
+        tuple(options.set),
+        options.host_budget,
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -161,6 +161,11 @@ def resolve_config(algorithm: str, preset: str, overrides: Mapping[str, object])
     return replace(base, **values)
 
 
+def setting_names(algorithm: str) -> frozenset[str]:
+    """Return what can be set of an algorithm, one that :data:`PRESETS` knows."""
+    return frozenset(field.name for preset in PRESETS[algorithm].values() for field in fields(preset))
+
+
 def _converted(name: str, annotation: str, value: object) -> object:
     """Return ``value`` as the type a field is annotated with; bool never counts as a number."""
     number = isinstance(value, int | float) and not isinstance(value, bool)

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,13 +19,23 @@ from common.errors import MessageError
 from common.frame_stack import FrameStack, Stack
 from common.inbox import Arrived, Inbox
 from common.messages import Action, PolicyExtras, TaskSpec, TimeStep, UInt8Array
-from common.policies.base import Observation, Policy
+from common.policies.base import ChosenAction, Observation, Policy
 from common.service import Service
 from services.actor.config import ActorSettings
 from services.actor.forwarding import ExperienceForwarder
 from services.actor.weights import PolicySwap
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Computed:
+    """An action that may not be answered with yet: a slower computer would still be computing it."""
+
+    arrived: Arrived[TimeStep]
+    chosen: ChosenAction
+    policy_version: int
+    due_ns: int
 
 
 class Actor:
@@ -52,6 +63,8 @@ class Actor:
         self._stack: FrameStack[UInt8Array] | None = FrameStack(spec.frame_stack) if spec.has_camera else None
         self._newest: tuple[int, int] = (-1, -1)
         self._last_answer = b""
+        self._unanswered: tuple[Arrived[TimeStep], Observation] | None = None
+        self._computed: Computed | None = None
         self._actions = 0
         service.counters = self.counters
         service.serve_commands({})
@@ -66,7 +79,7 @@ class Actor:
             while not service.stopping.is_set() and service.finished is None:
                 with service.wake:
                     if not (self._time_steps or self._resent):
-                        service.clock.wait(service.wake, 0.1)
+                        self._wait()
                 self.take_time_steps()
             self._drain()
         finally:
@@ -80,7 +93,8 @@ class Actor:
         for item in arrived:
             stack = self._add_frames(item.message)
         if arrived:
-            self._act_on(arrived[-1], stack)
+            self._see(arrived[-1], stack)
+        self._act()
         for item in arrived:
             self._forwarder.add(item.message)
 
@@ -102,40 +116,71 @@ class Actor:
             self._service.refusals.refuse(topics.TIME_STEP.name, error)
             return None
 
-    def _act_on(self, newest: Arrived[TimeStep], stack: Stack[UInt8Array] | None) -> None:
+    def _wait(self) -> None:
+        """For the next message, or until a computed action is due; holds ``wake``."""
+        service = self._service
+        if self._computed:
+            service.clock.wait_until(self._computed.due_ns, service.wake)
+        else:
+            service.clock.wait(service.wake, 0.1)
+
+    def _see(self, newest: Arrived[TimeStep], stack: Stack[UInt8Array] | None) -> None:
+        """Take note of what is to be answered next."""
         order = _order(newest.message)
         if order == self._newest and self._last_answer:
             # Published again: the bridge has not seen the answer.
             self._action_publisher.put(self._last_answer)
         if order <= self._newest:
             return
-        self._newest, self._last_answer = order, b""
+        self._newest, self._last_answer, self._unanswered = order, b"", None
         if newest.message.is_last or (stack is None and self._spec.has_camera):
             return
         frames = np.stack(stack.frames) if stack else None
-        self._answer(newest, Observation(frames, newest.message.proprioception, newest.message.action))
+        observation = Observation(frames, newest.message.proprioception, newest.message.action)
+        self._unanswered = newest, observation
 
-    def _answer(self, arrived: Arrived[TimeStep], observation: Observation) -> None:
-        time_step = arrived.message
+    def _act(self) -> None:
+        """Answer with what has been computed, if it is due; only then compute the next action."""
+        if self._computed and self._service.clock.now_ns() >= self._computed.due_ns:
+            self._answer(self._computed)
+            self._computed = None
+        if self._unanswered is None or self._computed:
+            return
+        (arrived, observation), self._unanswered = self._unanswered, None
         if self._spec.pacing == "lockstep":
             self._wait_for_updates()
+        begun_ns = self._service.clock.now_ns()
         policy = self._swap.policy
-        chosen = policy.act(observation, self._rng)
-        self._last_answer = encode(
+        computed = Computed(
+            arrived,
+            policy.act(observation, self._rng),
+            policy.version,
+            due_ns=begun_ns + round(self._settings.min_inference_s * 1e9),
+        )
+        if self._service.clock.now_ns() >= computed.due_ns:
+            self._answer(computed)
+        else:
+            self._computed = computed
+
+    def _answer(self, computed: Computed) -> None:
+        time_step, chosen = computed.arrived.message, computed.chosen
+        answer = encode(
             Action(
                 actor_incarnation=self._service.incarnation,
                 incarnation=time_step.incarnation,
                 answered_seq=time_step.seq,
                 action=chosen.action,
                 log_probability=chosen.log_probability,
-                policy_version=policy.version,
-                received_ns=arrived.at_ns,
+                policy_version=computed.policy_version,
+                received_ns=computed.arrived.at_ns,
                 sent_ns=self._service.clock.now_ns(),
             )
         )
-        self._action_publisher.put(self._last_answer)
+        self._action_publisher.put(answer)
         self._actions += 1
-        extras = PolicyExtras(chosen.action, chosen.log_probability, policy.version)
+        if _order(time_step) == self._newest:
+            self._last_answer = answer
+        extras = PolicyExtras(chosen.action, chosen.log_probability, computed.policy_version)
         self._forwarder.remember_answer(time_step, extras)
 
     def _wait_for_updates(self) -> None:

@@ -16,6 +16,8 @@ class ActorSettings(JournalSettings):
     """Threads of one policy evaluation."""
     real_time_priority: bool = setting(True)
     """Run before ordinary processes, where the system allows it; not in lockstep."""
+    min_inference_s: float = setting(0.0, low=0.0, high=10.0)
+    """Least time that computing an action takes, seconds: stands for a slower computer. Nothing else waits for it."""
     lockstep_surplus: float = setting(2.0, low=0.0)
     """In lockstep, the actor waits while replay has more unspent updates than this."""
 

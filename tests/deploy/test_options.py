@@ -41,6 +41,15 @@ def test_everything_can_be_said() -> None:
     assert options.network == "wifi_bad, changed"
 
 
+def test_a_host_budget_is_a_host_s_name_or_file(tmp_path: Path) -> None:
+    command = ["local_only", "--task", "dot_reacher", "--host-budget"]
+    host = parse_options([*command, "jetson"]).request.learner_host
+    assert host is not None
+    assert (host.name, host.replay_capacity) == ("jetson", 16_000)
+    with pytest.raises(ConfigError, match=r"'board\.toml': expected one of jetson, laptop, workstation, or the path"):
+        parse_options([*command, "board.toml"])
+
+
 def test_a_mode_with_two_hosts_has_an_ideal_network_unless_told() -> None:
     assert choose_network(load_placement("remote_only"), None, {}) == ("ideal", PRESETS["ideal"])
     assert choose_network(load_placement("remote_local"), "outage", {}) == ("outage", PRESETS["outage"])

@@ -10,6 +10,7 @@ import pytest
 from common.config import build_config, to_tables
 from common.errors import ConfigError
 from common.topics import SERVICES, Lane
+from deploy.hosts import Host as Computer
 from deploy.network import PRESETS, Crossing, Direction, Host, NetworkPart, NoLink
 from deploy.placement import load_placement
 from deploy.plan import CONFIG_CLASSES, PORTS, PortMap, RunRequest, crossings, plan_run, split_overrides
@@ -199,3 +200,30 @@ def test_a_wrong_request_is_refused_by_name(request_values: dict[str, Any], mess
 def test_a_task_of_the_user_s_own_table_is_known() -> None:
     configurations = plan(task="mine", overrides=("tasks.mine=my_module:MyTask",))
     assert configurations["robot_bridge"].tasks.rows == {"mine": "my_module:MyTask"}
+
+
+BOARD = Computer("board", device="cpu", threads=3, inference_s=0.012, updates_per_step=0.25, replay_capacity=5000)
+
+
+def test_the_learner_s_computer_becomes_plain_settings() -> None:
+    configurations = plan(learner_host=BOARD)
+    for name in ("actor", "replay", "learner"):
+        assert configurations[name].algorithm.overrides == {"replay_ratio": 0.25, "replay_capacity": 5000}
+    assert (configurations["learner"].learner.device, configurations["learner"].learner.threads) == ("cpu", 3)
+    assert configurations["actor"].actor.min_inference_s == 0.012
+
+
+@pytest.mark.parametrize(
+    ("mode", "inference_s"), [("local_only", 0.012), ("remote_only", 0.012), ("remote_local", 0.0)]
+)
+def test_actions_take_as_long_as_on_the_learner_s_computer_only_where_they_are_computed_there(
+    mode: str, inference_s: float
+) -> None:
+    assert plan(mode, learner_host=BOARD)["actor"].actor.min_inference_s == inference_s
+
+
+def test_an_override_wins_over_the_learner_s_computer() -> None:
+    configurations = plan(learner_host=BOARD, overrides=("algorithm.replay_ratio=2.0", "learner.threads=1"))
+    assert configurations["replay"].algorithm.overrides["replay_ratio"] == 2.0
+    assert configurations["replay"].algorithm.overrides["replay_capacity"] == 5000
+    assert configurations["learner"].learner.threads == 1

@@ -83,6 +83,13 @@ def test_the_record_is_that_of_a_launched_run(tmp_path):
     assert len(EpisodeTable(tmp_path / "run").update()) == values["episodes"] > 0
 
 
+def test_a_weaker_computer_learns_with_fewer_updates(tmp_path):
+    values = train(small(tmp_path / "run", host_budget="jetson"))
+    transitions = values["experience"]["persisted"] - attempts_of(tmp_path / "run")
+    assert (transitions - 30) // 12 <= values["updates"] <= (transitions - 29) // 12
+    assert 'host_budget = "jetson"' in (tmp_path / "run" / "run.toml").read_text()
+
+
 def attempts_of(run_dir: Path) -> int:
     part = json.loads(next(run_dir.glob("parts/robot_bridge-*.json")).read_text())
     return int(part["counters"]["attempts"])
@@ -115,6 +122,7 @@ def test_a_stop_before_anything_is_begun_leaves_nothing(tmp_path, monkeypatch, c
         ({"task": "dot_racher"}, "dot_reacher"),
         ({"overrides": ("task.time_limitt=3",)}, "time_limit"),
         ({"overrides": ("algorithm.preset=none_such",)}, "none_such"),
+        ({"host_budget": "jetsn"}, "did you mean 'jetson'"),
         ({"overrides": ("robot_bridge.pacing=realtime",)}, "lockstep"),
     ],
 )

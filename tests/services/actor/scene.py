@@ -37,12 +37,12 @@ class TellingPolicy:
 class Scene:
     """The actor, not running: tests call ``take`` for a round of its loop."""
 
-    def __init__(self, directory, spec=None, clock=None) -> None:
+    def __init__(self, directory, spec=None, clock=None, **settings) -> None:
         self.spec = spec or make_spec()
         self.network = InMemoryNetwork()
         self.service = SoloService(topics.ACTOR, self.network, directory, clock, incarnation=ACTOR)
         self.policy = TellingPolicy()
-        self.actor = Actor(self.service, self.spec, self.policy, ActorSettings())
+        self.actor = Actor(self.service, self.spec, self.policy, ActorSettings(**settings))
         self.peer = Peer(self.network)
         self.actions = self.peer.messages(topics.ACTION)
         self.experiences = self.peer.messages(topics.EXPERIENCE)

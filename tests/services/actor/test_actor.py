@@ -297,3 +297,51 @@ def test_the_actor_runs_until_everything_is_with_replay(tmp_path):
     assert not loop.is_alive()
     assert scene.service.state == "drained"
     assert scene.actor.counters()["unacknowledged"] == 0
+
+
+def test_an_answer_comes_no_sooner_than_a_slower_computer_would_give_it(tmp_path):
+    clock = FakeClock(0)
+    scene = Scene(tmp_path, clock=clock, min_inference_s=0.012)
+    assert scene.take(1) == []
+    clock.advance_to(11_999_999)
+    assert scene.take() == []
+    clock.advance_to(12_000_000)
+    (action,) = scene.take()
+    assert (action.answered_seq, action.received_ns, action.sent_ns) == (1, 0, 12_000_000)
+
+
+def test_who_still_computes_answers_that_first_and_then_the_newest_of_what_came_meanwhile(tmp_path):
+    clock = FakeClock(0)
+    scene = Scene(tmp_path, clock=clock, min_inference_s=0.100)
+    assert scene.take(0) == []
+    for seq, at_ns in ((1, 40_000_000), (2, 80_000_000)):
+        clock.advance_to(at_ns)
+        assert scene.take(seq) == []
+    clock.advance_to(100_000_000)
+    assert seqs(scene.take()) == [0]
+    assert len(scene.policy.observations) == 2
+    assert stack_ids(scene.policy.observations[-1]) == [0, 0, 1, 2]
+    clock.advance_to(200_000_000)
+    assert seqs(scene.take()) == [2]
+
+
+def test_while_an_action_is_held_back_experience_goes_on_to_replay(tmp_path):
+    scene = Scene(tmp_path, clock=FakeClock(0), min_inference_s=1.0)
+    scene.actor._forwarder.start()
+    scene.take(0)
+    scene.take(1)
+    eventually(lambda: len(scene.experiences) == 2)
+    scene.actor._forwarder.stop()
+    assert len(scene.actions) == 0
+
+
+def test_an_observation_that_is_over_before_its_turn_is_not_answered(tmp_path):
+    clock = FakeClock(0)
+    scene = Scene(tmp_path, clock=clock, min_inference_s=0.100)
+    scene.take(0)
+    scene.take(1)
+    scene.take(scene.time_step(2, terminated=True))
+    clock.advance_to(100_000_000)
+    assert seqs(scene.take()) == [0]
+    clock.advance_to(300_000_000)
+    assert scene.take() == []
