@@ -25,7 +25,7 @@ from deploy.network import (
     direction_random,
 )
 from deploy.network.conditions import direction_from
-from deploy.network.part import DirectionCounts, outages_so_far
+from deploy.network.part import DeviceBytes, DirectionCounts, outages_so_far
 from experiments.simulation import SimulatedClock
 from experiments.virtual_tcp import TcpStream
 
@@ -65,13 +65,17 @@ class VirtualLink:
     def part(self) -> NetworkPart:
         """The link's part of the record."""
         now_ns = self._clock.now_ns()
+        uplink, downlink = (self.directions[name].counts for name in DIRECTIONS)
         return NetworkPart(
             kind=BACKEND,
             start_monotonic_ns=self._start_ns,
             written_monotonic_ns=now_ns,
-            directions={name: direction.finished_counts() for name, direction in self.directions.items()},
+            directions={name: direction.counts for name, direction in self.directions.items()},
             outages=outages_so_far(OutageTimes.from_conditions(self._conditions), self._start_ns, now_ns),
-            kernel={},
+            kernel={
+                "local": DeviceBytes(uplink.bytes_in, downlink.bytes_delivered),
+                "remote": DeviceBytes(downlink.bytes_in, uplink.bytes_delivered),
+            },
         )
 
 
@@ -93,15 +97,11 @@ class VirtualDirection:
         if isinstance(fate, DropCause):
             counts.dropped[fate.value] += 1
             return fate
-        # In simulated time, what is on its way at the end counts as delivered.
+        counts.max_queue_delay_ms = self._schedule.max_queue_delay_s * 1e3
+        # What is on its way at the end of a simulation counts as delivered.
         counts.packets_delivered += 1
         counts.bytes_delivered += size_bytes
         return max(0, round((fate - now_s) * 1e9))
-
-    def finished_counts(self) -> DirectionCounts:
-        """The counts so far."""
-        self.counts.max_queue_delay_ms = self._schedule.max_queue_delay_s * 1e3
-        return self.counts
 
 
 class VirtualNetwork(InMemoryNetwork):

@@ -138,7 +138,7 @@ class TcpStream:
     # ------------------------------------------------------------------ sender
 
     def _send(self) -> None:
-        while self._in_flight < self._window:
+        while self._in_flight + 1 <= self._window:
             if self._lost:
                 segment = self._lost.popleft()
                 if segment.number not in self._outstanding:
