@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import tomllib
 from pathlib import Path
 
 import pytest
 
-from common.errors import ConfigError
 from deploy.episodes import EpisodeTable
 from experiments.train import Training, main, train
 
@@ -19,7 +19,7 @@ SMALL = (
     "algorithm.min_size_to_sample=30",
     "algorithm.policy_push_interval=5",
     "algorithm.replay_capacity=500",
-    "task.target_half_width=0.4",
+    "task.target_half_width=0.6",
     f"actor.min_inference_s={INFERENCE_S}",
     f"learner.min_update_s={UPDATE_S}",
 )
@@ -36,20 +36,31 @@ def configuration(run_dir: Path, service: str):
     return tomllib.loads((run_dir / "config" / f"{service}.toml").read_text())
 
 
-@pytest.mark.parametrize("task", ["dot_reacher", "visual_dot_reacher"])
-def test_the_same_seed_gives_the_same_run_over_a_bad_network_with_outages(task, tmp_path):
-    settings = () if task == "dot_reacher" else ("task.target_half_width=0.4",)
-    outages = ("network.outage_every_s=3", "network.outage_s=1")
-    for name, seed in (("one", 3), ("two", 3), ("other", 4)):
-        train(small(tmp_path / name, *settings, *outages, task=task, network="wifi_bad", seed=seed))
+OUTAGES = ("network.outage_every_s=3", "network.outage_s=1")
+
+
+@pytest.fixture(scope="module")
+def bad(tmp_path_factory):
+    """A run over a bad network with outages."""
+    run_dir = tmp_path_factory.mktemp("bad")
+    train(small(run_dir, *OUTAGES, network="wifi_bad"))
+    return run_dir
+
+
+def test_the_same_seed_gives_the_same_run_over_a_bad_network_with_outages(bad, tmp_path):
+    train(small(tmp_path, *OUTAGES, network="wifi_bad"))
     for file in ("episodes.csv", "actions.csv", "policy.msgpack", "network.json"):
-        one, two = ((tmp_path / name / file).read_bytes() for name in ("one", "two"))
-        assert one == two, file
-    assert (tmp_path / "one/actions.csv").read_bytes() != (tmp_path / "other/actions.csv").read_bytes()
+        assert (bad / file).read_bytes() == (tmp_path / file).read_bytes(), file
 
 
-def test_nothing_is_lost_over_a_bad_network_with_outages(tmp_path):
-    values = train(small(tmp_path / "run", "network.outage_every_s=3", "network.outage_s=1", network="wifi_bad"))
+def test_another_seed_gives_another_run(bad, tmp_path):
+    train(small(tmp_path, *OUTAGES, network="wifi_bad", seed=1, steps=50))
+    one, other = ((folder / "network.json").read_bytes() for folder in (bad, tmp_path))
+    assert one != other
+
+
+def test_nothing_is_lost_over_a_bad_network_with_outages(bad):
+    values = json.loads((bad / "summary.json").read_text())
     experience = values["experience"]
     assert (values["steps"], experience["lost"], experience["duplicated"]) == (150, 0, 0)
     assert experience["produced"] == experience["persisted"] > 100
@@ -66,14 +77,14 @@ def test_nothing_is_lost_over_a_bad_network_with_outages(tmp_path):
 def test_an_answer_takes_inference_processes_and_what_the_placement_puts_in_between(mode, crossing_ms, tmp_path):
     network = tmp_path / "network.toml"
     network.write_text("[network]\n[network.uplink]\ndelay_ms = 5\n[network.downlink]\ndelay_ms = 7\n")
-    values = train(small(tmp_path / "run", mode=mode, network=None if mode == "local_only" else str(network)))
+    values = train(small(tmp_path / "run", steps=40, mode=mode, network=None if mode == "local_only" else str(network)))
     expected_ms = crossing_ms + PROCESSES_MS + INFERENCE_S * 1e3
     assert values["observation_to_action_ms"] == {"p50": pytest.approx(expected_ms), "p99": pytest.approx(expected_ms)}
     assert values["late_actions"] == 0
 
 
 def test_an_action_that_takes_longer_than_the_cycle_is_late_and_the_world_goes_on(tmp_path):
-    values = train(small(tmp_path / "run", "actor.min_inference_s=0.05", mode="local_only"))
+    values = train(small(tmp_path / "run", "actor.min_inference_s=0.05", mode="local_only", steps=60))
     assert values["observation_to_action_ms"]["p50"] >= 50
     assert values["late_actions"] > 0.8 * values["cycles"] / 2, "every other observation is answered, 11 ms too late"
     assert values["overruns"] == 0
@@ -88,34 +99,31 @@ def test_updates_take_their_time(tmp_path):
 
 
 def test_a_policy_takes_the_downlink_s_rate(tmp_path):
-    """The learner pushes 7 kB after each fifth update; at 100 kbit/s that is over half a second."""
-    slow, fast = (
+    for rate in (0.1, 100):
         train(small(tmp_path / str(rate), f"network.downlink.rate_mbit={rate}", mode="remote_local"))
-        for rate in (0.1, 100)
-    )
-    pushed = {
-        name: part["counters"] for name, part in (("slow", actor(tmp_path / "0.1")), ("fast", actor(tmp_path / "100")))
-    }
-    assert fast["policy_pushes"] - pushed["fast"]["policies_received"] <= 1
-    assert pushed["slow"]["policies_received"] < pushed["fast"]["policies_received"]
-    assert slow["observation_to_action_ms"]["p50"] == fast["observation_to_action_ms"]["p50"]
+    # 7 kB after each fifth update: at 100 kbit/s that takes over half a second, and the robot has gone on meanwhile.
+    slow, fast = (policies_received(tmp_path / str(rate)) for rate in (0.1, 100))
+    assert len(slow) == len(fast) > 4
+    assert sum(slow) < 0.8 * sum(fast)
 
 
-def actor(run_dir: Path):
-    return json.loads(next(run_dir.glob("parts/actor-*.json")).read_text())
+def policies_received(run_dir: Path) -> list[float]:
+    """The actor's count, once a second of the first six."""
+    with (run_dir / "metrics" / "actor.csv").open(newline="") as file:
+        return [float(row["policies_received"] or 0) for row in csv.DictReader(file)][:6]
 
 
 def test_the_record_is_that_of_a_launched_run(tmp_path):
-    values = train(small(tmp_path / "run", network="wifi_office"))
+    values = train(small(tmp_path / "run", network="wifi_office", task="visual_dot_reacher", steps=60))
     assert values == json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert (values["mode"], values["network"], values["steps"]) == ("remote_only", "wifi_office", 150)
+    assert (values["mode"], values["network"], values["steps"]) == ("remote_only", "wifi_office", 60)
     run = tomllib.loads((tmp_path / "run" / "run.toml").read_text())
     assert (run["run"]["pacing"], run["run"]["backend"]) == ("virtual", "virtual")
     assert (run["placement"]["robot_bridge"], run["placement"]["actor"]) == ("local", "remote")
     assert run["conditions"]["uplink"]["delay_ms"] == 3.0
     link = values["network_link"]
-    # TCP/IP's and Zenoh's headers are most of it: the messages of this task are small.
-    assert 1 < link["uplink"]["ratio"] < 2
+    # TCP/IP's headers, acknowledgements and repetitions.
+    assert 1 < link["uplink"]["ratio"] < 1.3
     for name in ("learning_curve.png", "metrics/learner.csv", "logs/train.log", "ring", "policy.msgpack"):
         assert (tmp_path / "run" / name).exists(), name
     assert len(EpisodeTable(tmp_path / "run").update()) == values["episodes"]
