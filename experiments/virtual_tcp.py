@@ -13,7 +13,8 @@ after Linux's defaults:
   (CUBIC's factor), then growing by one packet per round trip; one packet after a time-out.
 
 Not modelled: delayed acknowledgements (each packet is acknowledged at once), acknowledgements on the back of data,
-CUBIC's growth over seconds without loss, the receiver's window, reordering, the handshake.
+CUBIC's growth over seconds without loss, the receiver's window, reordering, the handshake. Nor is BBR, which some
+systems prefer: it does not take a loss for congestion, so it carries more over a link that loses some percent.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ MIN_VARIATION_NS = 200_000_000
 """Linux's least retransmission time-out is this much above the round trip."""
 MAX_TIMEOUT_NS = 120_000_000_000
 UNKNOWN_ROUND_TRIP_TIMEOUT_NS = 1_000_000_000
-TIMER_NS = 2_000_000
-"""Two ticks of the kernel: the least that its loss timers add."""
+TIMER_NS = 8_000_000
+"""The least that the kernel's loss timers add: two ticks, of which most kernels have 250 a second."""
 RACK_CERTAIN = 3
 """Packets acknowledged behind a missing one, from which on it is lost without further waiting."""
 

@@ -91,8 +91,8 @@ def test_a_loss_is_not_believed_before_a_quarter_of_the_round_trip_is_over():
     scene.write(0, "a")
     scene.write(40, "b")
     scene.write(41, "c")
-    # c's acknowledgement comes at 61, and b, sent at 40, is lost from 40 + 20 + 5 on, plus the timer's 2.
-    assert scene.run() == [("a", 10), ("b", 77), ("c", 77)]
+    # c's acknowledgement comes at 61, and b, sent at 40, is lost from 40 + 20 + 5 on, plus the timer's 8.
+    assert scene.run() == [("a", 10), ("b", 83), ("c", 83)]
 
 
 def test_a_lone_message_that_is_lost_comes_after_the_time_out():
@@ -119,8 +119,8 @@ def test_the_end_of_a_burst_is_asked_for_after_two_round_trips():
     scene = Scene(lose=lambda number, _: number in (3, 4))
     scene.write(0, "a")
     scene.write(1000, "b", 4 * SEGMENT_BYTES)
-    # Of two, the last is sent again at 1020 + 2 * 20 + 2 = 1062; its acknowledgement at 1082 shows the other's loss.
-    assert scene.run() == [("a", 10), ("b", 1092)]
+    # Of two, the last is sent again at 1020 + 2 * 20 + 8 = 1068; its acknowledgement at 1088 shows the other's loss.
+    assert scene.run() == [("a", 10), ("b", 1098)]
 
 
 def test_a_silence_is_tested_at_doubling_intervals_and_all_that_was_written_in_it_arrives():
