@@ -13,7 +13,7 @@ from common.config import to_tables
 from common.errors import ConfigError
 from common.record import write_atomically
 from common.topics import LEARNER, ROBOT_BRIDGE
-from deploy.hosts import load_host
+from deploy.hosts import Host, load_host
 from deploy.network import NetworkConditions, NoLink
 from deploy.options import NO_NETWORK, choose_network, make_run_id
 from deploy.placement import Placement, load_placement
