@@ -82,9 +82,10 @@ class Comparison:
         rows.append(("steps per goal", _text(self.real.steps_per_goal), _text(self.virtual.steps_per_goal)))
         lines = [f"{name:27} {real:>18} {virtual:>18}".rstrip() for name, real, virtual in rows]
         overlap = "overlap" if self.learning_overlaps else "do not overlap"
+        limit = f"at most {100 * MAX_LATENCY_DIFFERENCE:.0f} %"
+        verdict = "agree" if self.agrees else "DISAGREE"
         lines.append(
-            f"p50 {100 * self.latency_difference:+.1f} % (at most {100 * MAX_LATENCY_DIFFERENCE:.0f} %), 95 % intervals "
-            f"of the steps per goal {overlap}: {'agree' if self.agrees else 'DISAGREE'}"
+            f"p50 {100 * self.latency_difference:+.1f} % ({limit}), 95 % intervals of the steps per goal {overlap}: {verdict}"
         )
         return "\n".join(lines)
 
