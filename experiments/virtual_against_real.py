@@ -79,14 +79,12 @@ class Comparison:
             for name, key in (("observation to action, p50", "p50_ms"), ("observation to action, p99", "p99_ms"))
         ]
         rows.append(("late actions", _text(self.real.late, 100, " %"), _text(self.virtual.late, 100, " %")))
-        rows.append(("steps per goal", _text(self.real.steps_per_goal), _text(self.virtual.steps_per_goal)))
+        rows.append(("steps per goal, 95 %", _text(self.real.steps_per_goal), _text(self.virtual.steps_per_goal)))
         lines = [f"{name:27} {real:>18} {virtual:>18}".rstrip() for name, real, virtual in rows]
         overlap = "overlap" if self.learning_overlaps else "do not overlap"
         limit = f"at most {100 * MAX_LATENCY_DIFFERENCE:.0f} %"
         verdict = "agree" if self.agrees else "DISAGREE"
-        lines.append(
-            f"p50 {100 * self.latency_difference:+.1f} % ({limit}), 95 % intervals of the steps per goal {overlap}: {verdict}"
-        )
+        lines.append(f"p50 {100 * self.latency_difference:+.1f} % ({limit}), intervals {overlap}: {verdict}")
         return "\n".join(lines)
 
 
