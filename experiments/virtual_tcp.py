@@ -7,8 +7,9 @@ after Linux's defaults:
 * a packet is lost when one that was sent later has been acknowledged and a quarter of the round trip is over (RACK,
   RFC 8985; at once from the third acknowledgement on). So a stream of small messages repairs a loss one message and
   one round trip later;
-* a tail loss probe after two round trips; without an answer the retransmission time-out, the round trip and 200 ms,
-  which doubles each time: after an outage a connection stays silent for up to as long again;
+* a tail loss probe two round trips after the newest data; without an answer the retransmission time-out, the round trip
+  and 200 ms, which doubles each time. As long as the window has room, new data goes out meanwhile, and the first of it
+  that gets through after an outage shows what was lost; a full window may stay silent for as long as the outage;
 * a congestion window: ten packets at first, doubling per round trip up to the first loss, which leaves 70 % of it
   (CUBIC's factor), then growing by one packet per round trip; one packet after a time-out.
 
@@ -140,6 +141,7 @@ class TcpStream:
 
     def _send(self) -> None:
         while self._in_flight + 1 <= self._window:
+            was_idle = self._in_flight == 0
             if self._lost:
                 segment = self._lost.popleft()
                 if segment.number not in self._outstanding:
@@ -150,15 +152,12 @@ class TcpStream:
                 self._outstanding[segment.number] = segment
             else:
                 return
-            self._transmit(segment)
-
-    def _transmit(self, segment: _Segment) -> None:
-        was_idle = self._in_flight == 0
-        segment.lost = False
-        self._in_flight += 1
-        self._put(segment)
-        if was_idle:
-            self._arm()
+            segment.lost = False
+            self._in_flight += 1
+            self._put(segment)
+            is_new = segment.transmissions == 1 and self._backoff == 1 and not self._in_recovery()
+            if was_idle or is_new:
+                self._arm()  # New data puts the probe off: its acknowledgement would tell as much.
 
     def _put(self, segment: _Segment) -> None:
         self._order += 1
@@ -199,7 +198,7 @@ class TcpStream:
             self._backoff, self._probed = 1, False
             if is_limiting:
                 self._grow(len(acknowledged))
-            self._arm()
+            self._arm(progress=True)
         self._detect_losses()
         self._send()
         if acknowledged:
@@ -264,16 +263,24 @@ class TcpStream:
 
     # ------------------------------------------------------------------ sender's timer
 
-    def _arm(self) -> None:
-        """Begin to wait anew: for a probe, or for the time-out."""
+    def _arm(self, *, progress: bool = False) -> None:
+        """Begin to wait anew, for a probe or for the time-out; ``progress``: because something has arrived."""
         self._timer += 1
         if not self._outstanding:
             return
-        number, time_out_ns, probe_ns = self._timer, self._time_out_ns(), self._probe_ns()
-        if probe_ns is not None and probe_ns < time_out_ns:
-            self._timers.call_later(probe_ns, lambda: self._probe(number))
-        else:
-            self._timers.call_later(time_out_ns, lambda: self._time_out(number))
+        number = self._timer
+        if not self._least_ns or self._backoff > 1 or self._in_recovery():
+            self._timers.call_later(self._time_out_ns(), lambda: self._time_out(number))
+            return
+        # Of a single segment the acknowledgement may be delayed on purpose.
+        wait_ns = round(2 * self._smoothed_ns) + (MIN_VARIATION_NS if len(self._outstanding) == 1 else TIMER_NS)
+        left_ns = self._time_out_ns() if progress else self._until_time_out_ns()
+        self._timers.call_later(min(wait_ns, left_ns) if left_ns > 0 else wait_ns, lambda: self._probe(number))
+
+    def _until_time_out_ns(self) -> int:
+        """Counted from when the oldest segment was sent; not above 0 if that is over."""
+        oldest = next(iter(self._outstanding.values()))
+        return oldest.sent_ns + self._time_out_ns() - self._timers.now_ns()
 
     def _time_out_ns(self) -> int:
         if not self._least_ns:
@@ -282,19 +289,18 @@ class TcpStream:
             self._backoff * round(self._smoothed_ns + max(MIN_VARIATION_NS, 4 * self._variation_ns)), MAX_TIMEOUT_NS
         )
 
-    def _probe_ns(self) -> int | None:
-        """When to ask with the last segment whether all has come; None: not now."""
-        if not self._least_ns or self._probed or self._backoff > 1 or self._in_recovery():
-            return None
-        # Of a single segment the acknowledgement may be delayed on purpose.
-        return round(2 * self._smoothed_ns) + (MIN_VARIATION_NS if len(self._outstanding) == 1 else TIMER_NS)
-
     def _probe(self, number: int) -> None:
-        if number == self._timer:
+        """Ask with the last segment whether all has come; once, then there is only the time-out."""
+        if number != self._timer:
+            return
+        if self._probed:
+            wait_ns = max(0, self._until_time_out_ns())
+        else:
             self._probed = True
             self.retransmitted += 1
             self._put(next(reversed(self._outstanding.values())))
-            self._arm()
+            wait_ns = self._time_out_ns()
+        self._timers.call_later(wait_ns, lambda: self._time_out(number))
 
     def _time_out(self, number: int) -> None:
         """Nothing has come back: all that is on its way counts as lost, and is sent again carefully."""
