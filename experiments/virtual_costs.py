@@ -13,14 +13,14 @@ import os
 import platform
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from common.algorithms import load_algorithm
-from common.algorithms.presets import resolve_config
+from common.algorithms.presets import resolve_config, setting_names
 from common.frame_ring import crop_shape
 from common.messages import TaskSpec
 from common.minibatch import Minibatch
@@ -56,7 +56,8 @@ def with_computing_times(configurations: Mapping[str, Any], host: Host | None) -
     inference_s, update_s = actor.actor.min_inference_s, learner.learner.min_update_s
     if not (inference_s and update_s):
         spec = _task_spec(configurations)
-        if host and not update_s:
+        # How often a computer updates is said of algorithms that replay experience; the others' are measured here.
+        if host and not update_s and "replay_ratio" in setting_names(learner.algorithm.name):
             update_s = spec.action_cycle_time_s / host.updates_per_step
         if not (inference_s and update_s):
             measured = _measured_once(spec, learner)
@@ -86,7 +87,8 @@ def measure(spec: TaskSpec, learner: Any) -> ComputingTimes:
     policy = initial_policy(spec, config.hidden_size, config.encoder_strides, 0, zero_initialised_head=False)
     observation = _observation(spec, rng)
     algorithm = load_algorithm(name)(spec, config, seed=0, device=settings.device, precision=settings.precision)
-    minibatch = _minibatch(spec, rng, config.batch_size)
+    # An on-policy algorithm learns from a whole rollout at once.
+    minibatch = _minibatch(spec, rng, getattr(config, "rollout_length", config.batch_size))
     return ComputingTimes(
         inference_s=_fastest_s(lambda: policy.act(observation, rng)),
         update_s=_fastest_s(lambda: algorithm.update(minibatch)),
@@ -161,16 +163,20 @@ def _minibatch(spec: TaskSpec, rng: np.random.Generator, rows: int) -> Minibatch
     def vectors(length: int) -> Any:
         return rng.uniform(-1.0, 1.0, (rows, length)).astype(np.float32)
 
-    return Minibatch(
-        frames=frames(),
-        proprioception=vectors(size.P),
-        previous_action=vectors(size.A),
-        action=vectors(size.A),
-        reward=-np.ones(rows, np.float32),
-        terminated=np.zeros(rows, np.float32),
-        next_frames=frames(),
-        next_proprioception=vectors(size.P),
-    )
+    values = {
+        "rows": np.arange(rows),
+        "frames": frames(),
+        "proprioception": vectors(size.P),
+        "previous_action": vectors(size.A),
+        "action": vectors(size.A),
+        "chosen_action": vectors(size.A),
+        "log_probability": -np.ones(rows, np.float32),
+        "reward": -np.ones(rows, np.float32),
+        "terminated": np.zeros(rows, np.float32),
+        "next_frames": frames(),
+        "next_proprioception": vectors(size.P),
+    }
+    return Minibatch(**{field.name: values[field.name] for field in fields(Minibatch)})
 
 
 def _fastest_s(work: Callable[[], object]) -> float:
