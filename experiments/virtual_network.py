@@ -108,17 +108,24 @@ class VirtualNetwork(InMemoryNetwork):
     """Carries messages between services that are placed on hosts."""
 
     def __init__(
-        self, clock: SimulatedClock, host: Mapping[str, Host], link: VirtualLink | None, message_s: float
+        self,
+        clock: SimulatedClock,
+        host: Mapping[str, Host],
+        link: VirtualLink | None,
+        message_s: float,
+        crossing_s: float = 0.0,
     ) -> None:
         """Args:
         clock: of the simulation.
         host: service -> where it runs.
         link: between the hosts; None if all services are on one.
         message_s: from a service to another through both their processes, besides the link, seconds.
+        crossing_s: what a message from host to host takes longer, besides the link's conditions, seconds.
         """
         super().__init__()
         self._clock, self._host, self._link = clock, host, link
         self._message_ns = round(message_s * 1e9)
+        self._crossing_ns = round((message_s + crossing_s) * 1e9)
         self._services: dict[InMemoryTransport, str] = {}
         self._streams: dict[tuple[str, str, Lane], TcpStream] = {}
         self._room = clock.condition()
@@ -153,7 +160,7 @@ class VirtualNetwork(InMemoryNetwork):
             self.dropped[topic.name] += 1
             return
         stream.write(
-            size_bytes, lambda: self._clock.call_later(self._message_ns, lambda: subscription.receive(payload))
+            size_bytes, lambda: self._clock.call_later(self._crossing_ns, lambda: subscription.receive(payload))
         )
         while topic.waits and stream.backlog_bytes > buffer_bytes:
             with self._room:

@@ -72,7 +72,9 @@ def test_nothing_is_lost_over_a_bad_network_with_outages(bad):
 
 
 @pytest.mark.parametrize(
-    ("mode", "crossing_ms"), [("local_only", 0), ("remote_local", 0), ("remote_only", 5 + 7)], ids=lambda value: value
+    ("mode", "crossing_ms"),
+    [("local_only", 0), ("remote_local", 0), ("remote_only", 5 + 7 + 0.7)],
+    ids=lambda value: value,
 )
 def test_an_answer_takes_inference_processes_and_what_the_placement_puts_in_between(mode, crossing_ms, tmp_path):
     network = tmp_path / "network.toml"
