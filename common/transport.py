@@ -15,6 +15,7 @@ import re
 import threading
 from collections import Counter, defaultdict
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from common.errors import EndpointInUseError, TransportError
@@ -230,13 +231,24 @@ class _CountingPublisher:
         self._put(payload)
 
 
+@dataclass(frozen=True, eq=False)
+class Subscription:
+    """Who listens on the in-memory twin, to what."""
+
+    transport: InMemoryTransport
+    pattern: re.Pattern[str]
+    """Of the key."""
+    receive: PayloadCallback
+
+
 class InMemoryNetwork:
     """The twin's mesh: delivers at once, on the sender's thread; ``drops`` decides what is lost on the way."""
 
     def __init__(self, drops: Callable[[Topic, bytes], bool] | None = None) -> None:
         self.drops = drops or (lambda topic, payload: False)
         self.lock = threading.RLock()
-        self.subscribers: dict[str, list[tuple[re.Pattern[str], PayloadCallback]]] = defaultdict(list)
+        self.subscriptions: dict[str, list[Subscription]] = defaultdict(list)
+        """By topic name."""
         self.cache: dict[str, tuple[object, bytes]] = {}
         self.answers: dict[str, tuple[object, Answer]] = {}
 
@@ -244,10 +256,12 @@ class InMemoryNetwork:
         """Join the mesh."""
         return InMemoryTransport(self, run)
 
-    def deliver(self, topic: Topic, payload: bytes, callbacks: list[PayloadCallback]) -> None:
+    def deliver(
+        self, topic: Topic, payload: bytes, sender: InMemoryTransport, subscriptions: list[Subscription]
+    ) -> None:
         """Hand a message to those who listened when it was published."""
-        for callback in callbacks:
-            callback(payload)
+        for subscription in subscriptions:
+            subscription.receive(payload)
 
     def ask(self, topic: Topic, payload: bytes, answer: Answer, timeout_s: float) -> bytes | None:
         """Carry a question to ``answer`` and its answer back, or None if that takes longer than ``timeout_s``."""
@@ -262,7 +276,6 @@ class InMemoryTransport:
         self._run = run
         self._closed = False
         self._lock = threading.Lock()
-        self._own: list[tuple[re.Pattern[str], PayloadCallback]] = []
         self.bytes_sent: Counter[str] = Counter()
         self.bytes_received: Counter[str] = Counter()
 
@@ -275,9 +288,9 @@ class InMemoryTransport:
             with self._network.lock:
                 if topic.delivery is Delivery.CACHED:
                     self._network.cache[key] = (self, payload)
-                listeners = [c for pattern, c in self._network.subscribers[topic.name] if pattern.fullmatch(key)]
+                listening = [s for s in self._network.subscriptions[topic.name] if s.pattern.fullmatch(key)]
             if not self._network.drops(topic, payload):
-                self._network.deliver(topic, payload, listeners)
+                self._network.deliver(topic, payload, self, listening)
 
         return _CountingPublisher(topic.name, put, self.bytes_sent, self._lock)
 
@@ -291,8 +304,7 @@ class InMemoryTransport:
             callback(payload)
 
         with self._network.lock:
-            self._own.append((pattern, receive))
-            self._network.subscribers[topic.name].append((pattern, receive))
+            self._network.subscriptions[topic.name].append(Subscription(self, pattern, receive))
             cached = self._network.cache.get(key) if topic.delivery is Delivery.CACHED else None
         if cached is not None:
             receive(cached[1])
@@ -313,8 +325,8 @@ class InMemoryTransport:
         self._closed = True
         network = self._network
         with network.lock:
-            for name, listeners in network.subscribers.items():
-                network.subscribers[name] = [item for item in listeners if item not in self._own]
+            for name, subscriptions in network.subscriptions.items():
+                network.subscriptions[name] = [item for item in subscriptions if item.transport is not self]
             network.answers = {key: item for key, item in network.answers.items() if item[0] is not self}
             network.cache = {key: item for key, item in network.cache.items() if item[0] is not self}
 

@@ -14,8 +14,9 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
+from common.run_settings import RunSettings
 from common.topics import Topic
-from common.transport import Answer, InMemoryNetwork, PayloadCallback
+from common.transport import Answer, InMemoryNetwork, InMemoryTransport, Subscription
 
 START_NS = 1_000_000_000
 
@@ -132,7 +133,9 @@ class _Turn:
     """One thread's place in the order."""
 
     def __init__(self) -> None:
-        self.baton = threading.Semaphore(0)
+        self.baton = threading.Lock()
+        """Released to whoever's turn it is, who takes it."""
+        self.baton.acquire()
         self.notified = False
         self.waits = 0
         """Waits begun; a time-out of an earlier one means nothing."""
@@ -207,13 +210,20 @@ class SimulatedNetwork(InMemoryNetwork):
         self.question_delays_ns: dict[str, int | Callable[[], int]] = {}
         """Topic of a query -> time from the question to its arrival."""
 
-    def deliver(self, topic: Topic, payload: bytes, callbacks: list[PayloadCallback]) -> None:
+    def transport_of(self, service: str, run: RunSettings) -> InMemoryTransport:
+        """Join the mesh as ``service``, which makes no difference here."""
+        return self.transport(run)
+
+    def deliver(
+        self, topic: Topic, payload: bytes, sender: InMemoryTransport, subscriptions: list[Subscription]
+    ) -> None:
         """See :class:`InMemoryNetwork`."""
+        deliver = super().deliver
         delay_ns = _drawn(self.delays_ns.get(topic.name, 0))
         if delay_ns:
-            self._clock.call_later(delay_ns, lambda: super(SimulatedNetwork, self).deliver(topic, payload, callbacks))
+            self._clock.call_later(delay_ns, lambda: deliver(topic, payload, sender, subscriptions))
         else:
-            super().deliver(topic, payload, callbacks)
+            deliver(topic, payload, sender, subscriptions)
 
     def ask(self, topic: Topic, payload: bytes, answer: Answer, timeout_s: float) -> bytes | None:
         """See :class:`InMemoryNetwork`; whoever asks waits meanwhile."""

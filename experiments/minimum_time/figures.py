@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from experiments.intervals import standard_error
 from experiments.minimum_time.findings import correlation
-from experiments.minimum_time.intervals import standard_error
 from experiments.minimum_time.results import CurveResult, PanelResult, StudyResult
 
 if TYPE_CHECKING:

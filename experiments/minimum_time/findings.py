@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.minimum_time.intervals import Interval, interval
+from experiments.intervals import Interval, interval
 from experiments.minimum_time.jobs import DEFAULT_HEAD, ZERO_HEAD
 from experiments.minimum_time.rank_correlation import RankCorrelation, rank_correlation
 from experiments.minimum_time.results import CurveResult, PanelResult, RunResult

@@ -10,8 +10,8 @@ import numpy as np
 
 from common.record import write_atomically
 from deploy.run_file import versions
+from experiments.intervals import standard_error
 from experiments.minimum_time.findings import findings, interval_text
-from experiments.minimum_time.intervals import standard_error
 from experiments.minimum_time.results import CurveResult, PanelResult, StudyResult
 
 _DECIDE_RUNS = ("python", "numpy", "torch", "mujoco", "dm-control")

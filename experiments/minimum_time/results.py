@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from experiments.grid import Row
+from experiments.intervals import Interval, interval, mean_and_half_width
 from experiments.minimum_time.curves import curve_steps, final_steps_per_goal, goals_within, return_curve
-from experiments.minimum_time.intervals import Interval, interval, mean_and_half_width
 from experiments.minimum_time.sizes import Figure, Panel, Size
 from experiments.workers import Key
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from common.record import write_atomically
-from experiments.minimum_time.intervals import standard_error
+from experiments.intervals import standard_error
 from experiments.minimum_time.results import CurveResult, StudyResult
 
 FINISHED = "finished"

@@ -33,6 +33,8 @@ class LearnerSettings:
     """Threads of an update; 0 leaves one core to the rest."""
     nice: int = setting(10, low=0, high=19)
     """Added to the process's niceness, so that updates never delay the bridge."""
+    min_update_s: float = setting(0.0, low=0.0, high=60.0)
+    """Least time that an update takes, seconds: stands for a slower computer."""
     prefetch: int = setting(2, low=1, high=16)
     """Minibatches asked for ahead of need."""
     push_share: float = setting(1.0, low=0.001, high=1.0)

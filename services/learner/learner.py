@@ -40,6 +40,7 @@ class Learner:
         self._pusher = PolicyPusher(service, settings.push_share)
         self._checkpoints = CheckpointWriter(Path(service.run.directory))
         self._checkpoint_ns = round(settings.checkpoint_s * 1e9)
+        self._min_update_ns = round(settings.min_update_s * 1e9)
         self._policy_version = policy_version
         self._metrics: dict[str, float] = {}
         self._rate = 0.0
@@ -93,9 +94,18 @@ class Learner:
         }
 
     def _update(self, minibatch: Minibatch) -> None:
+        due_ns = self._service.clock.now_ns() + self._min_update_ns
         self._algorithm.update(minibatch)
+        self._wait_until(due_ns)
         if self._algorithm.updates % self._config.policy_push_interval == 0:
             self._push()
+
+    def _wait_until(self, due_ns: int) -> None:
+        """A slower computer would still be updating."""
+        service, clock = self._service, self._service.clock
+        while clock.now_ns() < due_ns and not service.stopping.is_set() and service.finished is None:
+            with service.wake:
+                clock.wait_until(due_ns, service.wake)
 
     def _push(self) -> None:
         # A learner without its predecessor's last version must not fall behind what the actor already has.

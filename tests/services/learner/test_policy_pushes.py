@@ -116,9 +116,9 @@ class SimulatedLink(InMemoryNetwork):
         self.puts = []
         """(seconds since the start, version, bytes) of each push."""
 
-    def deliver(self, topic, payload, callbacks) -> None:
+    def deliver(self, topic, payload, sender, subscriptions) -> None:
         def arrive():
-            super(SimulatedLink, self).deliver(topic, payload, callbacks)
+            super(SimulatedLink, self).deliver(topic, payload, sender, subscriptions)
 
         if topic is topics.POLICY:
             seconds = (self._clock.now_ns() - START_NS) / 1e9

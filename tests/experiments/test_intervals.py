@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from experiments.minimum_time.intervals import interval, mean_and_half_width, standard_error, student_t_975
+from experiments.intervals import interval, mean_and_half_width, standard_error, student_t_975
 
 
 @pytest.mark.parametrize(
