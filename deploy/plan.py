@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from common.algorithms import ALGORITHMS
-from common.algorithms.presets import setting_names
+from common.algorithms.presets import presets_of, resolve_config, setting_names
 from common.config import Tables, build_config, parse_override, section_names
 from common.errors import ConfigError
+from common.run_settings import AlgorithmSettings
 from common.topics import ACTOR, LEARNER, REPLAY, ROBOT_BRIDGE, SERVICES, Lane
 from deploy.computers import TwoComputers
 from deploy.hosts import Host
@@ -141,6 +142,8 @@ def plan_run(
         service: build_config(CONFIG_CLASSES[service], tables[service], f"{service}.toml") for service in SERVICES
     }
     _check_task(configurations[ROBOT_BRIDGE])
+    for service in (ACTOR, REPLAY, LEARNER):
+        _check_algorithm(configurations[service].algorithm)
     _check_access(request.placement, configurations)
     _check_shared_memory(request.placement, configurations)
     return configurations
@@ -261,6 +264,19 @@ def _check_task(bridge: RobotBridgeConfig) -> None:
         close = difflib.get_close_matches(bridge.task.name, known, 1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
         raise ConfigError(f"--task {bridge.task.name}: expected one of {', '.join(sorted(known))}{hint}")
+
+
+def _check_algorithm(algorithm: AlgorithmSettings) -> None:
+    """Which preset the task asks for, the bridge will say; what fits none of them is told before anything starts."""
+    errors = []
+    for preset in [algorithm.preset] if algorithm.preset else presets_of(algorithm.name):
+        try:
+            resolve_config(algorithm.name, preset, algorithm.overrides)
+        except ConfigError as error:
+            errors.append(error)
+        else:
+            return
+    raise ConfigError(f"[algorithm]: {errors[0]}")
 
 
 def _check_access(placement: Placement, configurations: Mapping[str, Any]) -> None:

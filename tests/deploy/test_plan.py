@@ -124,6 +124,10 @@ def test_an_override_wins_over_an_option() -> None:
         ("run.directory=/elsewhere", "use --run-dir"),
         ("transport.listen_bulk=tcp/127.0.0.1:1", "--base-port"),
         ("threads=2", "expected section.key=value"),
+        ("algorithm.batch_siz=12", r"\[algorithm\]: sac: unknown setting 'batch_siz'"),
+        ("algorithm.batch_size=abc", r"\[algorithm\]: batch_size = 'abc': expected int"),
+        ("algorithm.batch_size=0", r"\[algorithm\]: batch_size = 0: expected an integer >= 1"),
+        ("algorithm.preset=nope", r"\[algorithm\]: unknown preset 'nope' of sac; known: "),
     ],
 )
 def test_a_wrong_override_is_refused_by_name(override: str, message: str) -> None:
