@@ -12,63 +12,33 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from deploy.console import Console
-from deploy.stop_signals import INTERRUPTED, StopSignals
 from experiments.command_line import exit_code
-from experiments.grid import GridRecord, Row, duration_text, run_grid
+from experiments.grid import Row, duration_text
 from experiments.minimum_time.figures import draw_figures
-from experiments.minimum_time.folders import RESULTS, keep_crashed, remove_half_finished, runs_folder
 from experiments.minimum_time.jobs import work
 from experiments.minimum_time.plan import Plan
 from experiments.minimum_time.report import table_text, write_report
 from experiments.minimum_time.results import collect
 from experiments.minimum_time.sizes import SIZES, Size
 from experiments.minimum_time.tables import write_tables
+from experiments.study import Study
 from experiments.target_hits.choice import check_count, usable_cores
-from experiments.workers import JobFailure, Key, Work, WorkerPool
+from experiments.workers import Key, Work
 
 _NAME = "experiments.minimum_time"
+_RESULTS = Path(__file__).parent / "results"
 
 
 def run_study(plan: Plan, out: Path, workers: int, console: Console, do: Work = work) -> int:
     """Run what is not finished, write the results of all that is; return the exit code."""
-    runs, settings = runs_folder(out), plan.settings()
-    failures: dict[Key, str] = {}
-
-    def report_failure(failure: JobFailure) -> None:
-        job = plan.jobs[failure.key]
-        failures[failure.key] = f"crashed: {failure.reason}"
-        kept = keep_crashed(runs, job)
-        console.error(
-            f"{_NAME}: {job.folder} crashed: {failure.reason}; the rest goes on; "
-            f"traceback: {runs / 'failures.log'}" + (f"; its record: {kept}" if kept else "")
-        )
-
-    with StopSignals() as stop, GridRecord(runs, settings) as record:
-        for name in remove_half_finished(runs, plan.jobs.values(), record.rows):
-            console.line(f"{name} was interrupted: removed, it begins again")
-        console.line(f"{_finished(plan, record)} of {len(plan.jobs)} jobs are finished; results go to {out}")
-        with WorkerPool(do, {**settings, "runs": str(runs)}, workers) as pool:
-            run_grid(
-                record,
-                list(plan.jobs),
-                pool,
-                progress=lambda progress: console.status(str(progress)),
-                failed=report_failure,
-                asked_to_stop=lambda: stop.asked,
-                cost=lambda key: plan.expected_s(plan.jobs[key]),
-            )
-        write_results(plan.size, record.rows, failures, out, console)
-        if failures:
-            console.error(
-                f"{_NAME}: {len(failures)} of {len(plan.jobs)} jobs crashed and are missing in the results; "
-                "the same command tries them again"
-            )
-        if stop.asked:
-            console.line(
-                f"interrupted: {_finished(plan, record)} of {len(plan.jobs)} jobs are kept; the same command goes on"
-            )
-            return INTERRUPTED
-    return 1 if failures else 0
+    study = Study(
+        _NAME,
+        plan.jobs,
+        plan.settings(),
+        plan.expected_s,
+        lambda rows, failures: write_results(plan.size, rows, failures, out, console),
+    )
+    return study.run(out, workers, console, do)
 
 
 def write_results(
@@ -85,10 +55,6 @@ def write_results(
     console.line(f"training took {duration_text(sum(row.get('core_s', 0.0) for row in rows.values()))} of one core")
     for path in paths:
         console.line(str(path))
-
-
-def _finished(plan: Plan, record: GridRecord) -> int:
-    return sum(key in record.rows for key in plan.jobs)
 
 
 def main(arguments: Sequence[str] | None = None, sizes: Mapping[str, Size] = SIZES, do: Work = work) -> int:
@@ -113,7 +79,7 @@ def main(arguments: Sequence[str] | None = None, sizes: Mapping[str, Size] = SIZ
     parser.add_argument("--plan", action="store_true", help="say what would be run and how long it takes; run nothing")
     options = parser.parse_args(arguments)
     console = Console()
-    out: Path = options.out or RESULTS / options.size
+    out: Path = options.out or _RESULTS / options.size
 
     def study() -> int:
         workers = check_count("--workers", options.workers)

@@ -13,6 +13,7 @@ import numpy as np
 from common.config import parse_override
 from common.errors import RelodError
 from deploy.episodes import EpisodeTable
+from experiments.run_folders import remove_rebuildable
 from experiments.target_hits.counting import count_hits
 from experiments.target_hits.initial_policy import initial_actions
 from experiments.target_hits.jobs import stream
@@ -24,9 +25,6 @@ from services.robot_bridge.tasks import load_task
 HITS, TRAINING = "hits", "training"
 ZERO_HEAD, DEFAULT_HEAD = "zero", "default"
 """How the actor's last layer is initialised."""
-
-_REBUILDABLE = ("ring", "checkpoint.npz")
-"""Files of a finished run that nobody asks for any more, up to gigabytes each."""
 
 
 class StudyError(RelodError):
@@ -130,6 +128,5 @@ def _run(job: Job, run_dir: Path, overrides: list[str]) -> list[int]:
                 f"has return {episode.episode_return}, length {episode.length} and ends at step {episode.steps}"
             )
         before = episode.steps
-    for name in _REBUILDABLE:
-        (run_dir / name).unlink(missing_ok=True)
+    remove_rebuildable(run_dir)
     return [episode.steps for episode in episodes]

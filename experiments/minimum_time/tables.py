@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from common.record import write_atomically
+from experiments.csv_text import csv_text, number_text
 from experiments.intervals import standard_error
 from experiments.minimum_time.results import CurveResult, StudyResult
 
@@ -27,7 +26,7 @@ def write_tables(directory: Path, study: StudyResult) -> list[Path]:
     paths = []
     for name, rows in tables.items():
         path = directory / name
-        write_atomically(path, _csv_text(rows))
+        write_atomically(path, csv_text(rows))
         paths.append(path)
     return paths
 
@@ -38,8 +37,8 @@ def run_rows(curves: Iterable[CurveResult]) -> Iterator[Mapping[str, Any]]:
         hits = list(curve.hits.values())
         of_curve = {
             **_names(curve),
-            "hits": _number(float(np.mean(hits)) if hits else float("nan")),
-            "hits_standard_error": _number(standard_error(hits) if hits else float("nan")),
+            "hits": number_text(float(np.mean(hits)) if hits else float("nan")),
+            "hits_standard_error": number_text(standard_error(hits) if hits else float("nan")),
         }
         for run in curve.runs:
             yield {
@@ -48,7 +47,7 @@ def run_rows(curves: Iterable[CurveResult]) -> Iterator[Mapping[str, Any]]:
                 "steps": run.steps,
                 "goals": run.goals,
                 "goals_last_1000": run.last_goals,
-                "steps_per_goal": _number(run.steps_per_goal),
+                "steps_per_goal": number_text(run.steps_per_goal),
                 "status": FINISHED,
             }
         for seed, reason in curve.missing.items():
@@ -84,23 +83,9 @@ def curve_rows(curves: Iterable[CurveResult]) -> Iterator[Mapping[str, Any]]:
             for part, values in (("", band.mean), ("_low", band.low), ("_high", band.high))
         }
         for at, *values in zip(curve.at, *columns.values(), strict=True):
-            numbers = dict(zip(columns, map(_number, values), strict=True))
+            numbers = dict(zip(columns, map(number_text, values), strict=True))
             yield {**_names(curve), "step": int(at), "runs": len(curve.runs), **numbers}
 
 
 def _names(curve: CurveResult) -> dict[str, Any]:
     return {"task": curve.panel.task, "preset": curve.panel.preset, "limit": curve.limit, "head": curve.head}
-
-
-def _number(value: float) -> str:
-    return "" if np.isnan(value) else f"{value:.3f}"
-
-
-def _csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
-    rows = list(rows)
-    text = io.StringIO()
-    if rows:
-        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    return text.getvalue()

@@ -9,12 +9,25 @@ from __future__ import annotations
 import shutil
 from collections.abc import Collection, Iterable
 from pathlib import Path
+from typing import Protocol
 
-from experiments.minimum_time.jobs import Job
 from experiments.workers import Key
 
-RESULTS = Path(__file__).parent / "results"
 _CRASHED = ".crashed"
+_REBUILDABLE = ("ring", "checkpoint.npz")
+"""Files of a finished run that nobody asks for any more, up to gigabytes each."""
+
+
+class FolderJob(Protocol):
+    """A job with a folder of its own."""
+
+    @property
+    def key(self) -> Key:
+        """The grid's key."""
+
+    @property
+    def folder(self) -> str:
+        """Name of its folder."""
 
 
 def runs_folder(out: Path) -> Path:
@@ -22,7 +35,13 @@ def runs_folder(out: Path) -> Path:
     return out / "runs"
 
 
-def remove_half_finished(runs: Path, jobs: Iterable[Job], finished: Collection[Key]) -> list[str]:
+def remove_rebuildable(run_dir: Path) -> None:
+    """Remove what takes most of a finished run's space."""
+    for name in _REBUILDABLE:
+        (run_dir / name).unlink(missing_ok=True)
+
+
+def remove_half_finished(runs: Path, jobs: Iterable[FolderJob], finished: Collection[Key]) -> list[str]:
     """Remove the folders of runs that were interrupted; return their names.
 
     A run cannot go on from its middle: it begins again, and gives what it would have given.
@@ -33,7 +52,7 @@ def remove_half_finished(runs: Path, jobs: Iterable[Job], finished: Collection[K
     return names
 
 
-def keep_crashed(runs: Path, job: Job) -> Path | None:
+def keep_crashed(runs: Path, job: FolderJob) -> Path | None:
     """Set a crashed run's folder aside, in place of that of an earlier crash; return where it is, if there is one."""
     folder, kept = runs / job.folder, runs / f"{job.folder}{_CRASHED}"
     if not folder.exists():

@@ -1,0 +1,1 @@
+"""Where the parts of a learning system run: what each distribution makes of learning, in virtual time."""

@@ -1,0 +1,85 @@
+"""What is compared, a line each: which algorithm learns, what runs where, and over which network.
+
+No run measures the computer it runs on. What a host's file does not say is set here: the inference time of an actor
+that is not on the learner's computer, and the duration of PPO's updates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+LAPTOP_ACTOR = ("actor.min_inference_s=0.003",)
+"""As the laptop's host file has it: in remote_local the laptop computes the actions (thesis 4.4)."""
+
+_PPO_UPDATE_S = 0.55
+"""From a rollout of Dot-Reacher, the preset's 2048 steps, measured on one Zen 4 core, which is the workstation here."""
+PPO_ON_WORKSTATION = (f"learner.min_update_s={_PPO_UPDATE_S}",)
+PPO_ON_LAPTOP = (f"learner.min_update_s={3 * _PPO_UPDATE_S:.2f}",)
+"""Slower by as much as the host files say of SAC's updates."""
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """A distribution of one algorithm over hosts."""
+
+    name: str
+    """Also the folders'."""
+    algorithm: str
+    mode: str
+    network: str | None
+    """Between the hosts; None: there is one host."""
+    host: str
+    """The learner's, a name of ``deploy/hosts/``."""
+    overrides: tuple[str, ...] = ()
+    """``section.key=value``"""
+
+
+SAC = (
+    Configuration("sac_workstation", "sac", "local_only", None, "workstation"),
+    Configuration("sac_laptop", "sac", "local_only", None, "laptop"),
+    Configuration("sac_jetson", "sac", "local_only", None, "jetson"),
+    Configuration("sac_remote_only_office", "sac", "remote_only", "wifi_office", "workstation"),
+    Configuration("sac_remote_only_bad", "sac", "remote_only", "wifi_bad", "workstation"),
+    Configuration("sac_remote_local_office", "sac", "remote_local", "wifi_office", "workstation", LAPTOP_ACTOR),
+    Configuration("sac_remote_local_bad", "sac", "remote_local", "wifi_bad", "workstation", LAPTOP_ACTOR),
+)
+PPO = (
+    Configuration("ppo_laptop", "ppo", "local_only", None, "laptop", PPO_ON_LAPTOP),
+    Configuration("ppo_remote_only_office", "ppo", "remote_only", "wifi_office", "workstation", PPO_ON_WORKSTATION),
+    Configuration(
+        "ppo_remote_local_office",
+        "ppo",
+        "remote_local",
+        "wifi_office",
+        "workstation",
+        (*LAPTOP_ACTOR, *PPO_ON_WORKSTATION),
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Question:
+    """Two configurations of which the thesis says something."""
+
+    configuration: str
+    against: str
+    finding: str
+    """What the thesis found, and where."""
+
+
+QUESTIONS = (
+    Question("sac_laptop", "sac_workstation", "SAC is worse on the laptop than on the workstation (Fig. 5.1)"),
+    Question("sac_jetson", "sac_workstation", "SAC hardly learns on the emulated Jetson (Fig. 5.1)"),
+    Question("sac_jetson", "sac_laptop", "SAC is worse on the emulated Jetson than on the laptop (Fig. 5.1)"),
+    Question(
+        "sac_remote_local_office", "sac_workstation", "Remote-Local comes within 10 % of the best (Fig. 5.1, 5.2)"
+    ),
+    Question("sac_remote_local_bad", "sac_workstation", "the same over a bad link (not in the thesis)"),
+    Question("sac_remote_only_office", "sac_laptop", "Remote-Only barely improves on the laptop alone (Fig. 5.1)"),
+    Question(
+        "sac_remote_only_office", "sac_remote_local_office", "Remote-Only is worse than Remote-Local (Fig. 5.1, 5.2)"
+    ),
+    Question("sac_remote_only_bad", "sac_remote_local_bad", "the same over a bad link (not in the thesis)"),
+    Question("ppo_remote_only_office", "ppo_laptop", "PPO is nearly the same in all modes (Fig. 5.3)"),
+    Question("ppo_remote_local_office", "ppo_laptop", "PPO is nearly the same in all modes (Fig. 5.3)"),
+)
