@@ -14,7 +14,7 @@ python = .venv/bin/python
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test test-stable-baselines3 check bench soak study-min-time format environment lock clean
+.PHONY: help demo test test-stable-baselines3 check bench soak study-min-time study-modes format environment lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-23s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -47,6 +47,9 @@ soak: environment ## run for 21 minutes; fail if memory or open files grow
 
 study-min-time: environment ## learn under several time limits; resumable; SIZE=small (within an hour) or thesis
 	$(python) -m experiments.minimum_time --size $(SIZE)
+
+study-modes: environment ## learn in several modes, in virtual time; resumable; SIZE=glance, small (within an hour) or thesis
+	$(python) -m experiments.distribution --size $(SIZE)
 
 format: environment ## format the code and fix what the linter can
 	$(python) -m ruff check --fix --exit-zero .

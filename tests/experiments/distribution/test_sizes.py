@@ -1,0 +1,65 @@
+"""The tables of what is run."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from common.topics import ACTOR, LEARNER
+from deploy.hosts import load_host
+from experiments.distribution.configurations import PPO, QUESTIONS, SAC
+from experiments.distribution.jobs import training_of
+from experiments.distribution.sizes import SIZES, SMALL, THESIS
+from experiments.training import plan_training
+
+CONFIGURATIONS = {
+    (panel.task, configuration.name): (panel, configuration)
+    for size in SIZES.values()
+    for panel in size.panels
+    for configuration in panel.configurations
+}
+
+
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_no_run_measures_this_computer(monkeypatch, name):
+    def refuse(*arguments):
+        raise AssertionError("a run of the study depends on the speed of this computer")
+
+    monkeypatch.setattr("experiments.virtual_costs._measured_once", refuse)
+    panel, configuration = CONFIGURATIONS[name]
+    training = training_of(panel.job(configuration, 0), asdict(configuration), Path("runs"))
+    configurations = plan_training(training).with_computing_times().configurations
+    assert configurations[ACTOR].actor.min_inference_s > 0
+    assert configurations[LEARNER].learner.min_update_s > 0
+    assert configurations[LEARNER].learner.threads == 1  # as many on every computer
+
+
+def test_the_actor_of_remote_local_is_as_slow_as_the_laptop_s():
+    for configuration in (*SAC, *PPO):
+        if configuration.mode == "remote_local":
+            assert f"actor.min_inference_s={load_host('laptop').inference_s}" in configuration.overrides
+
+
+def test_questions_are_about_configurations_that_are_run_in_one_panel():
+    panels = [{configuration.name for configuration in panel.configurations} for panel in SMALL.panels]
+    for question in QUESTIONS:
+        assert any({question.configuration, question.against} <= names for names in panels), question
+
+
+def test_each_run_has_a_key_and_a_folder_of_its_own():
+    for size in SIZES.values():
+        jobs = size.jobs()
+        assert len({job.key for job in jobs}) == len({job.folder for job in jobs}) == len(jobs)
+
+
+def test_small_takes_two_cores_less_than_an_hour():
+    assert sum(map(SMALL.expected_s, SMALL.jobs())) / 2 < 3600
+
+
+def test_thesis_has_twenty_seeds_of_states_and_five_of_images_at_least():
+    seeds = {
+        task: [panel.seeds for panel in THESIS.panels if panel.task == task]
+        for task in ("dot_reacher", "visual_dot_reacher")
+    }
+    assert min(seeds["dot_reacher"]) >= 20
+    assert min(seeds["visual_dot_reacher"]) >= 5
