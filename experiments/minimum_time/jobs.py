@@ -18,7 +18,8 @@ from experiments.target_hits.counting import count_hits
 from experiments.target_hits.initial_policy import initial_actions
 from experiments.target_hits.jobs import stream
 from experiments.target_hits.world import World
-from experiments.train import Training, train
+from experiments.train import train
+from experiments.training import Training
 from experiments.workers import Key
 from services.robot_bridge.tasks import load_task
 

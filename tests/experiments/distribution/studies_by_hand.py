@@ -20,7 +20,7 @@ SMALL_NETWORKS = (
 BY_NAME = {configuration.name: configuration for configuration in SAC}
 LAPTOP, REMOTE_LOCAL = BY_NAME["sac_laptop"], BY_NAME["sac_remote_local_bad"]
 TINY = Size(
-    "tiny", (Panel("both", "Two", "dot_reacher", (LAPTOP, REMOTE_LOCAL), 150, 2, window=50, overrides=SMALL_NETWORKS),)
+    "tiny", (Panel("both", "Two", "dot_reacher", (LAPTOP, REMOTE_LOCAL), 150, 1, window=50, overrides=SMALL_NETWORKS),)
 )
 """Few enough steps to be really run."""
 HAND_MADE = Size(
