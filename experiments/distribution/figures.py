@@ -57,6 +57,7 @@ def _draw_curves(axis: Axes, panel: PanelResult) -> None:
         axis.plot(result.at, mean, color=colour, linewidth=1.6, label=result.configuration.name)
         axis.fill_between(result.at, low, high, color=colour, alpha=0.15, linewidth=0)
     axis.set_yscale("log")
+    axis.set_ylim(1, panel.panel.steps)  # What a goal can take; the bands of few runs go beyond.
     axis.set_xlim(0, panel.panel.steps)
     axis.set_xlabel("steps of the run, resets included")
     axis.set_ylabel(f"steps per goal in {panel.panel.window} steps, geometric mean")

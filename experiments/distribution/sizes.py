@@ -79,6 +79,7 @@ def _ppo(steps: int, seeds: int) -> Panel:
     return Panel("ppo_dot_reacher", "PPO, dot_reacher", "dot_reacher", PPO, steps, seeds, window=2000)
 
 
+# Too short and too few to tell configurations apart that are close to each other.
 GLANCE = Size("glance", (_sac("dot_reacher", 3000, 4),))
 SMALL = Size("small", (_sac("dot_reacher", 5000, 20), _ppo(50_000, 5)))
 THESIS = Size("thesis", (_sac("dot_reacher", 10_000, 30), _ppo(100_000, 30), _sac("visual_dot_reacher", 10_000, 10)))
