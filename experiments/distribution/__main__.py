@@ -39,7 +39,8 @@ def write_results(
     figures = draw_figures(out, study)
     paths += [*figures, write_report(out, study, f"python -m {_NAME} --size {size.name}", figures)]
     console.line(table_text(study))
-    console.line(f"training took {duration_text(sum(row['core_s'] for row in rows.values()))} of one core")
+    core_s = sum(run.row["core_s"] for result in study.configurations for run in result.runs)
+    console.line(f"training took {duration_text(core_s)} of one core")
     for path in paths:
         console.line(str(path))
 
