@@ -6,13 +6,11 @@ kept: the same command goes on where it was interrupted.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from deploy.console import Console
-from experiments.command_line import exit_code
 from experiments.distribution.figures import draw_figures
 from experiments.distribution.jobs import work
 from experiments.distribution.plan import Plan
@@ -20,12 +18,10 @@ from experiments.distribution.report import table_text, write_report, write_tabl
 from experiments.distribution.results import collect
 from experiments.distribution.sizes import SIZES, Size
 from experiments.grid import Row, duration_text
-from experiments.study import Study
-from experiments.target_hits.choice import check_count, usable_cores
+from experiments.study_program import StudyProgram
 from experiments.workers import Key, Work
 
 _NAME = "experiments.distribution"
-_RESULTS = Path(__file__).parent / "results"
 
 
 def write_results(
@@ -45,45 +41,18 @@ def write_results(
         console.line(str(path))
 
 
+PROGRAM = StudyProgram(
+    _NAME,
+    "How SAC and PPO learn, distributed over hosts and networks.",
+    Path(__file__).parent / "results",
+    Plan,
+    write_results,
+)
+
+
 def main(arguments: Sequence[str] | None = None, sizes: Mapping[str, Size] = SIZES, do: Work = work) -> int:
-    """Run a study from the command line; return the exit code.
-
-    Args:
-        arguments: of the command line.
-        sizes: name -> study; the first is the default.
-        do: does a job.
-    """
-    parser = argparse.ArgumentParser(
-        prog=f"python -m {_NAME}", description="How SAC and PPO learn, distributed over hosts and networks."
-    )
-    parser.add_argument("--size", choices=sizes, default=next(iter(sizes)), help="of the study (default: %(default)s)")
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="of the results (default: experiments/distribution/results/SIZE)"
-    )
-    parser.add_argument(
-        "--workers", type=int, default=usable_cores(), metavar="N", help="processes (default: one a core, %(default)s)"
-    )
-    parser.add_argument("--plan", action="store_true", help="say what would be run and how long it takes; run nothing")
-    options = parser.parse_args(arguments)
-    console = Console()
-    out: Path = options.out or _RESULTS / options.size
-
-    def run() -> int:
-        workers = check_count("--workers", options.workers)
-        plan = Plan(sizes[options.size])
-        if options.plan:
-            console.line(plan.text(workers))
-            return 0
-        study = Study(
-            _NAME,
-            plan.jobs,
-            plan.settings(),
-            plan.size.expected_s,
-            lambda rows, failures: write_results(plan.size, rows, failures, out.absolute(), console),
-        )
-        return study.run(out.absolute(), workers, console, do)
-
-    return exit_code(_NAME, "--out", out, console, run)
+    """Run the study; as :meth:`StudyProgram.main`."""
+    return PROGRAM.main(arguments, sizes, do)
 
 
 if __name__ == "__main__":

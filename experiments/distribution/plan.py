@@ -39,11 +39,15 @@ class Plan:
         """What the rows depend on besides their keys, one name each: a configuration that is new adds to them."""
         return dict(self._settings)
 
+    def expected_s(self, job: Job) -> float:
+        """Seconds that a job takes one core, roughly."""
+        return self.size.expected_s(job)
+
     def text(self, workers: int) -> str:
         """What there is to do, and how long it will take."""
         seconds: Counter[str] = Counter()
         for job in self.jobs.values():
-            seconds[job.setting] += round(self.size.expected_s(job))
+            seconds[job.setting] += round(self.expected_s(job))
         runs = Counter(job.setting for job in self.jobs.values())
         lines = [f"{name}, {runs[name]} seeds: {duration_text(of_one)} of one core" for name, of_one in seconds.items()]
         total_s = sum(seconds.values())
