@@ -18,7 +18,8 @@ _DECIDE_RUNS = ("python", "numpy", "torch", "mujoco")
 _READING = """\
 Steps per goal are those of a whole run, resets included: its steps by its goals; a run without a goal counts as if it
 had reached one at its end. Means are over seeds with 95 % intervals by Student's t. Ratios are geometric means over the
-seeds that both have, with 95 % intervals from the logarithms; the intervals are not corrected for their number."""
+seeds that both have, with 95 % intervals from the logarithms; the intervals are not corrected for their number. Bars
+are about the means."""
 
 
 def write_tables(directory: Path, study: StudyResult) -> list[Path]:
@@ -82,15 +83,26 @@ def panel_lines(panel: PanelResult) -> list[str]:
     lines = _table(rows)
     if panel.answers:
         rows = [
-            ["configuration", "against", "ratio", "pairs", "here", "thesis"],
-            ["---", "---", "--:", "--:", "---", "---"],
+            ["configuration", "against", "ratio", "pairs", "here", "of means", "bar", "", "thesis"],
+            ["---", "---", "--:", "--:", "---", "--:", "---", "---", "---"],
         ]
         for answer in panel.answers:
             question = answer.question
             within = "" if math.isnan(answer.low) else f" [{answer.low:.2f}, {answer.high:.2f}]"
             ratio = f"{answer.ratio:.2f}{within}"
-            row = [question.configuration, question.against, ratio, str(answer.pairs), answer.verdict, question.finding]
-            rows.append(row)
+            rows.append(
+                [
+                    question.configuration,
+                    question.against,
+                    ratio,
+                    str(answer.pairs),
+                    answer.verdict,
+                    f"{answer.ratio_of_means:.2f}",
+                    question.bar.text() if question.bar else "",
+                    {None: "", True: "holds", False: "does not hold"}[answer.keeps_bar],
+                    question.finding,
+                ]
+            )
         lines += ["", *_table(rows)]
     return lines
 

@@ -97,6 +97,10 @@ class Answer:
     low: float
     """Of its 95 % interval; NaN for one pair."""
     high: float
+    ratio_of_means: float
+    """Over all seeds of either: what the question's bar is about."""
+    keeps_bar: bool | None
+    """None: there is no bar."""
 
     @property
     def verdict(self) -> str:
@@ -104,6 +108,23 @@ class Answer:
         if math.isnan(self.low) or self.low <= 1.0 <= self.high:
             return "cannot be told apart"
         return "needs more steps per goal" if self.low > 1.0 else "needs fewer steps per goal"
+
+
+def _answer(question: Question, result: ConfigurationResult, against: ConfigurationResult) -> Answer | None:
+    """The answer; None where no seed is common to both."""
+    left, right = ({run.seed: run.steps_per_goal for run in each.runs} for each in (result, against))
+    seeds = sorted(left.keys() & right.keys())
+    if not seeds:
+        return None
+    logarithm = interval([math.log(left[seed] / right[seed]) for seed in seeds])
+    mean, other = result.steps_per_goal, against.steps_per_goal
+    return Answer(
+        question,
+        len(seeds),
+        *(math.exp(value) for value in (logarithm.mean, logarithm.low, logarithm.high)),
+        ratio_of_means=mean.mean / other.mean,
+        keeps_bar=None if question.bar is None else question.bar.holds(mean, other),
+    )
 
 
 @dataclass(frozen=True)
@@ -122,19 +143,12 @@ class PanelResult:
     def answers(self) -> list[Answer]:
         """To the questions about this panel's configurations."""
         results = {result.configuration.name: result for result in self.measured}
-        answers = []
-        for question in QUESTIONS:
-            if not {question.configuration, question.against} <= set(results):
-                continue
-            left, right = (
-                {run.seed: run.steps_per_goal for run in results[name].runs}
-                for name in (question.configuration, question.against)
-            )
-            if seeds := sorted(left.keys() & right.keys()):
-                logarithm = interval([math.log(left[seed] / right[seed]) for seed in seeds])
-                ratio, low, high = (math.exp(value) for value in (logarithm.mean, logarithm.low, logarithm.high))
-                answers.append(Answer(question, len(seeds), ratio, low, high))
-        return answers
+        return [
+            answer
+            for question in QUESTIONS
+            if {question.configuration, question.against} <= set(results)
+            and (answer := _answer(question, results[question.configuration], results[question.against]))
+        ]
 
 
 @dataclass(frozen=True)

@@ -81,6 +81,6 @@ def _ppo(steps: int, seeds: int) -> Panel:
 
 # Too short and too few to tell configurations apart that are close to each other.
 GLANCE = Size("glance", (_sac("dot_reacher", 3000, 4),))
-SMALL = Size("small", (_sac("dot_reacher", 5000, 20), _ppo(50_000, 5)))
+SMALL = Size("small", (_sac("dot_reacher", 5000, 20), _ppo(50_000, 5), _sac("visual_dot_reacher", 5000, 5)))
 THESIS = Size("thesis", (_sac("dot_reacher", 10_000, 30), _ppo(100_000, 30), _sac("visual_dot_reacher", 10_000, 10)))
 SIZES = {size.name: size for size in (SMALL, THESIS, GLANCE)}

@@ -4,6 +4,8 @@ import math
 
 import pytest
 
+from experiments.distribution.bars import AtMost
+from experiments.distribution.configurations import Question
 from experiments.distribution.results import collect, curve_rows, run_rows
 from tests.experiments.distribution.studies_by_hand import HAND_MADE, hand_made
 
@@ -35,6 +37,17 @@ def test_configurations_are_compared_by_the_ratio_of_equal_seeds():
     assert answer.ratio == pytest.approx(ratio)
     assert answer.low < ratio < answer.high
     assert answer.verdict == "needs more steps per goal"
+
+
+def test_a_bar_is_held_against_the_means_of_all_seeds(monkeypatch):
+    for factor, keeps in ((2.0, False), (2.1, True)):
+        question = Question("sac_laptop", "sac_workstation", "worse", AtMost(factor))
+        monkeypatch.setattr("experiments.distribution.results.QUESTIONS", (question,))
+        (panel,) = collect(HAND_MADE, rows(), {}).panels
+        (answer,) = panel.answers
+        means = [sum(1000 / (goals - seed) for seed in range(3)) / 3 for goals in (50, 100)]
+        assert answer.ratio_of_means == pytest.approx(means[0] / means[1])  # 2.02
+        assert answer.keeps_bar is keeps
 
 
 def test_a_seed_that_one_configuration_lacks_is_compared_with_nothing():
