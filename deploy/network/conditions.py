@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -100,9 +101,12 @@ class NetworkConditions:
     """From the start of one outage to the start of the next, s. The first starts this long after the link."""
     outage_s: float = 0.0
     """How long nothing gets through, s; 0: no outages."""
+    congestion_control: str = ""
+    """Of both hosts' TCP, e.g. ``cubic``; empty: this computer's. Only in namespaces can it be another."""
 
     def __post_init__(self) -> None:
         check_outages(self.outage_every_s, self.outage_s, where="network")
+        check_congestion_control(self.congestion_control, where="network")
 
     def direction(self, direction: Direction) -> DirectionConditions:
         return self.uplink if direction == "uplink" else self.downlink
@@ -119,7 +123,9 @@ class NetworkConditions:
     def to_table(self) -> dict[str, Any]:
         """The table that ``parse_network`` turns back into equal conditions."""
         directions = {name: self.direction(name).to_table() for name in DIRECTIONS}
-        return {**directions, "outage_every_s": self.outage_every_s, "outage_s": self.outage_s}
+        link = {"outage_every_s": self.outage_every_s, "outage_s": self.outage_s}
+        chosen = {"congestion_control": self.congestion_control} if self.congestion_control else {}
+        return {**directions, **link, **chosen}
 
 
 def bytes_per_s(rate_mbit: float | None) -> float | None:
@@ -220,6 +226,15 @@ def check_outages(every_s: object, length_s: object, where: str) -> None:
     length = _check_number(f"{where}.outage_s", length_s, "seconds >= 0")
     if length > 0 and length >= every:
         raise ConfigError(f"{where}.outage_s = {length_s!r}: expected less than outage_every_s = {every_s!r}")
+
+
+def check_congestion_control(name: object, where: str) -> None:
+    """Refuse what is no name; the hosts find out whether their kernel knows it."""
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z0-9_]*", name):
+        raise ConfigError(
+            f"{where}.congestion_control = {name!r}: expected a name of net.ipv4.tcp_available_congestion_control, "
+            "e.g. 'cubic', or '' (this computer's)"
+        )
 
 
 def _check_number(key: str, value: object, expected: str, upper: float = math.inf) -> float:

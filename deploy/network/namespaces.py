@@ -9,11 +9,13 @@ import os
 import re
 import shutil
 import subprocess
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar, Self
 
+from common.errors import ConfigError
 from deploy.network.conditions import HOSTS, Direction, Host, NetworkConditions
 from deploy.network.errors import LinkFailedError, LinkUnavailable
 from deploy.network.link_process import LinkProcess
@@ -30,7 +32,7 @@ _OWN_NAME = re.compile(r"relod-(\d+)-(?:local|remote)")
 _COMMAND_TIMEOUT_S = 10.0
 
 
-class NamespaceHosts:
+class NamespaceHosts(ABC):
     """Each host is a network namespace of its own; what joins them is the subclasses' business.
 
     The hosts reach each other and themselves, and nothing else: whoever wants to talk to their services has
@@ -40,7 +42,8 @@ class NamespaceHosts:
     addresses: ClassVar[Mapping[Host, str]] = {"local": "10.213.77.1", "remote": "10.213.77.2"}
     """Address of each host. The same in every run: namespaces do not see each other."""
 
-    def __init__(self) -> None:
+    def __init__(self, conditions: NetworkConditions) -> None:
+        self._conditions = conditions
         self._created: list[str] = []
         self._final_bytes: dict[Direction, int] | None = None
 
@@ -79,13 +82,13 @@ class NamespaceHosts:
             return self._final_bytes
         return {"uplink": self._sent_bytes("local"), "downlink": self._sent_bytes("remote")}
 
+    @abstractmethod
     def _join(self) -> None:
         """Join the two namespaces; each needs a device :data:`DEVICE`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _stop(self) -> None:
         """End what joins them; harmless if it was never begun."""
-        raise NotImplementedError
 
     def _sent_bytes(self, host: Host) -> int:
         """Bytes of IP packets that the host has sent into the link."""
@@ -101,6 +104,21 @@ class NamespaceHosts:
         self._created.append(name)  # first: an interrupted command may have made it all the same
         run_command("ip", "netns", "add", name)
         run_command("ip", "-n", name, "link", "set", "lo", "up")
+        self._choose_congestion_control(host)
+
+    def _choose_congestion_control(self, host: Host) -> None:
+        name = self._conditions.congestion_control
+        if not name:
+            return
+        directory = "/proc/sys/net/ipv4"
+        inside = (*self.command_prefix(host), "sh", "-c")
+        try:
+            run_command(*inside, f"echo {name} > {directory}/tcp_congestion_control")
+        except LinkUnavailable as error:
+            allowed = run_command(*inside, f"cat {directory}/tcp_allowed_congestion_control").split()
+            raise ConfigError(
+                f"network.congestion_control = {name!r}: this kernel allows a namespace {', '.join(allowed)}"
+            ) from error
 
     def _set_up(self, host: Host) -> None:
         """Give the host's device its address."""
@@ -126,7 +144,7 @@ class NamespaceLink(NamespaceHosts):
     """The hosts are joined by a process that carries their packets, :mod:`deploy.network.tun`."""
 
     def __init__(self, conditions: NetworkConditions, run_dir: Path, seed: int = 0) -> None:
-        super().__init__()
+        super().__init__(conditions)
         self._process = LinkProcess("deploy.network.tun", conditions, run_dir, seed)
 
     def __enter__(self) -> Self:

@@ -43,8 +43,7 @@ class NetemLink(NamespaceHosts):
     """The hosts are joined by a pair of virtual cards, each with a queue ``netem`` where packets leave."""
 
     def __init__(self, conditions: NetworkConditions, run_dir: Path) -> None:
-        super().__init__()
-        self._conditions = conditions
+        super().__init__(conditions)
         self._part_path = run_dir / "network.json"
         self._start_monotonic_ns = 0
         self._final_part: NetworkPart | None = None

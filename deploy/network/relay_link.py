@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from common.errors import ConfigError
 from deploy.network.conditions import Direction, Host, NetworkConditions
 from deploy.network.errors import LinkFailedError
 from deploy.network.link import LOOPBACK, Crossing
@@ -26,12 +27,18 @@ class RelayLink:
     def __init__(
         self, conditions: NetworkConditions, run_dir: Path, crossings: Iterable[Crossing], seed: int = 0
     ) -> None:
+        self._conditions = conditions
         self._process = LinkProcess("deploy.network.relay", conditions, run_dir, seed)
         # Sorted and without repetitions: two services that dial the same port share a relay port.
         self._crossings = sorted(set(crossings), key=dataclasses.astuple)
         self._relay_ports: dict[Crossing, int] = {}
 
     def __enter__(self) -> Self:
+        if name := self._conditions.congestion_control:
+            raise ConfigError(
+                f"network.congestion_control = {name!r}: the relay's TCP runs over loopback and has no use for it; "
+                "expected '', or namespaces as the backend"
+            )
         try:
             ready = self._process.start(
                 ["--crossings", json.dumps([dataclasses.asdict(crossing) for crossing in self._crossings])]

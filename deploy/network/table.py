@@ -13,6 +13,7 @@ from deploy.network.conditions import (
     DIRECTIONS,
     DirectionConditions,
     NetworkConditions,
+    check_congestion_control,
     check_key,
     check_outages,
     check_together,
@@ -22,7 +23,7 @@ from deploy.network.trace import TRACE_ENDS, parse_trace
 
 _TRACE_END = "trace_end"
 _DIRECTION_KEYS = (*(item.name for item in dataclasses.fields(DirectionConditions)), _TRACE_END)
-_OUTAGE_KEYS = ("outage_every_s", "outage_s")
+_LINK_KEYS = ("outage_every_s", "outage_s", "congestion_control")
 
 
 def load_network(name_or_path: str | Path) -> NetworkConditions:
@@ -45,7 +46,7 @@ def parse_network(table: Mapping[str, Any], where: str = "network", directory: P
     directions, and those of ``[network.uplink]`` and ``[network.downlink]`` override one. ``where`` begins
     the key in errors; a trace's relative path starts from ``directory``.
     """
-    _check_table(table, where, ("preset", *DIRECTIONS, *_DIRECTION_KEYS, *_OUTAGE_KEYS))
+    _check_table(table, where, ("preset", *DIRECTIONS, *_DIRECTION_KEYS, *_LINK_KEYS))
     preset = table.get("preset", "ideal")
     if not isinstance(preset, str) or preset not in PRESETS:
         raise ConfigError(f"{where}.preset = {preset!r}: expected {_preset_names()}")
@@ -65,7 +66,9 @@ def parse_network(table: Mapping[str, Any], where: str = "network", directory: P
     every_s = table.get("outage_every_s", start.outage_every_s)
     length_s = table.get("outage_s", start.outage_s)
     check_outages(every_s, length_s, where)
-    return NetworkConditions(directions["uplink"], directions["downlink"], every_s, length_s)
+    congestion_control = table.get("congestion_control", start.congestion_control)
+    check_congestion_control(congestion_control, where)
+    return NetworkConditions(directions["uplink"], directions["downlink"], every_s, length_s, congestion_control)
 
 
 def _direction(
@@ -105,5 +108,5 @@ def _check_table(table: object, where: str, known: tuple[str, ...]) -> None:
     for key, value in table.items():
         if key in known:
             continue
-        hint = "; outages belong to both directions: set them in [network]" if key in _OUTAGE_KEYS else ""
+        hint = "; it belongs to both directions: set it in [network]" if key in _LINK_KEYS else ""
         raise ConfigError(f"{where}.{key} = {value!r}: unknown key, expected one of {', '.join(known)}{hint}")

@@ -36,6 +36,16 @@ def test_a_table_made_from_conditions_gives_them_back(conditions: NetworkConditi
     assert parse_network(conditions.to_table()) == conditions
 
 
+def test_congestion_control_belongs_to_the_link_and_is_a_name() -> None:
+    conditions = parse_network({"preset": "wifi_bad", "congestion_control": "cubic"})
+    assert conditions.congestion_control == "cubic"
+    assert parse_network(conditions.to_table()) == conditions
+    with pytest.raises(ConfigError, match=r"network.congestion_control = 'a; b': expected a name"):
+        parse_network({"congestion_control": "a; b"})
+    with pytest.raises(ConfigError, match=r"network.uplink.congestion_control = 'cubic'.*set it in \[network\]"):
+        parse_network({"uplink": {"congestion_control": "cubic"}})
+
+
 def test_a_file_overrides_a_preset_in_both_directions_and_then_in_one(tmp_path: Path) -> None:
     path = tmp_path / "net.toml"
     path.write_text(
@@ -107,7 +117,7 @@ def test_a_rate_of_8_mbit_is_a_million_bytes_per_second() -> None:
         ({"uplink": {"loss": -0.1}}, "network.uplink.loss", "-0.1", "between 0 and 1"),
         ({"downlink": {"speed": 1}}, "network.downlink.speed", "1", "rate_mbit"),
         ({"downlink": 3}, "network.downlink", "3", "a table"),
-        ({"uplink": {"outage_s": 1}}, "network.uplink.outage_s", "1", "set them in [network]"),
+        ({"uplink": {"outage_s": 1}}, "network.uplink.outage_s", "1", "set it in [network]"),
         ({"outage_s": 1}, "network.outage_s", "1", "less than outage_every_s = 0"),
         ({"outage_every_s": 2, "outage_s": 2}, "network.outage_s", "2", "less than outage_every_s = 2"),
         ({"outage_every_s": -2}, "network.outage_every_s", "-2", "seconds >= 0"),

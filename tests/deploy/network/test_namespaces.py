@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from common.errors import ConfigError
 from deploy.network import DirectionConditions, LinkUnavailable, NamespaceLink, NetworkConditions
 from deploy.network import namespaces as namespaces_module
+from deploy.network.conditions import HOSTS
 from deploy.network.namespaces import namespace_name, remove_stale_namespaces
 from tests.deploy.network.conftest import RunOn
 
@@ -128,6 +130,21 @@ def test_a_command_keeps_its_process_id_and_cannot_leave_the_emulated_network(tm
     with NamespaceLink(NetworkConditions(), tmp_path) as network_link:
         process = run_on(network_link, "remote", program)
         assert process.communicate(timeout=10)[0] == f"{process.pid} ['lo', 'net0']\n"
+
+
+@needs_namespaces
+def test_the_hosts_have_the_congestion_control_that_was_chosen(tmp_path: Path, run_on: RunOn) -> None:
+    program = "print(open('/proc/sys/net/ipv4/tcp_congestion_control').read())"
+    with NamespaceLink(NetworkConditions(congestion_control="reno"), tmp_path) as network_link:
+        for host in HOSTS:
+            assert run_on(network_link, host, program).communicate(timeout=10)[0].split() == ["reno"]
+
+
+@needs_namespaces
+def test_a_congestion_control_that_the_kernel_lacks_is_refused_with_those_it_has(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"network.congestion_control = 'fast': this kernel allows .*reno"):
+        NamespaceLink(NetworkConditions(congestion_control="fast"), tmp_path).__enter__()
+    assert _own_namespaces() == []
 
 
 @needs_namespaces

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from common.errors import ConfigError
 from deploy.network import (
     Crossing,
     DirectionConditions,
@@ -158,6 +159,11 @@ def test_a_crossing_that_was_not_announced_cannot_be_dialled(tmp_path: Path, por
         pytest.raises(LinkFailedError, match="was not among the crossings"),
     ):
         network_link.dial_address("remote", "local", port)
+
+
+def test_the_relay_refuses_a_congestion_control_that_it_cannot_have(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"congestion_control = 'cubic'.*expected '', or namespaces"):
+        RelayLink(NetworkConditions(congestion_control="cubic"), tmp_path, []).__enter__()
 
 
 def test_a_crossing_joins_two_hosts() -> None:
