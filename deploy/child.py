@@ -19,7 +19,8 @@ from deploy.run_file import REPOSITORY
 FRESH_S = 3.0
 """A part that was written this long ago, three of its periods, belongs to a process that lives."""
 _TAIL_LINES = 6
-_TIED_COMMAND = Path(__file__).resolve().with_name("tied_command.py")
+TIED_COMMAND = Path(__file__).resolve().with_name("tied_command.py")
+"""Program that ties the process which it becomes to the one that started it."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Child:
         self.console.parent.mkdir(parents=True, exist_ok=True)
         self._started_ns = time.time_ns()
         # -S -E: nothing but the standard library is needed before it becomes the command.
-        tied = [sys.executable, "-S", "-E", str(_TIED_COMMAND), str(os.getpid())]
+        tied = [sys.executable, "-S", "-E", str(TIED_COMMAND), str(os.getpid())]
         with self.console.open("ab") as console:
             self._process = subprocess.Popen(
                 [*tied, *self.service.command],

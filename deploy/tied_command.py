@@ -1,6 +1,7 @@
 """``python tied_command.py PARENT_PID COMMAND...``: becomes COMMAND, which gets SIGTERM if the parent dies.
 
-The launcher starts the services through it, so that none of them is left behind when the launcher is killed. It is
+The launcher starts the services through it, so that none of them is left behind when the launcher is killed; a study
+starts the launcher through it. It is
 a program of its own because a launcher with threads must not run Python code between fork and exec.
 """
 
@@ -20,7 +21,9 @@ def main() -> None:
     # Linux keeps the setting over exec, also over that of `ip netns exec`.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if os.getppid() != parent_pid:  # it died before it could be told to signal
-        sys.exit("the launcher has ended")
+        sys.exit("the process that started this one has ended")
+    # What the parent has blocked would stay blocked in the command, which then could not be ended in order.
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
     try:
         os.execvp(command[0], command)
     except OSError as error:

@@ -54,6 +54,8 @@ class StudyProgram(Generic[ASize, AJob]):
     """Below it, by the sizes' names, what is not sent elsewhere by ``--out``."""
     plan: Callable[[ASize], StudyPlan[AJob]]
     write_results: WriteResults[ASize]
+    most_workers: Callable[[ASize], int | None] = lambda size: None
+    """Jobs of a size that may be done side by side; None: any number."""
 
     def main(self, arguments: Sequence[str] | None, sizes: Mapping[str, ASize], work: Work) -> int:
         """Run a study from the command line; return the exit code.
@@ -71,6 +73,8 @@ class StudyProgram(Generic[ASize, AJob]):
 
         def run() -> int:
             workers = check_count("--workers", options.workers)
+            if (most := self.most_workers(size)) is not None:
+                workers = min(workers, most)
             plan = self.plan(size)
             if options.plan:
                 console.line(plan.text(workers))

@@ -1,4 +1,4 @@
-"""``python -m experiments.distribution``: which distribution of the computations learns best, in virtual time.
+"""``python -m experiments.distribution``: which distribution of the computations learns best.
 
 Trains every configuration of a study with several seeds, and writes tables, figures and a README. What is finished is
 kept: the same command goes on where it was interrupted.
@@ -47,6 +47,7 @@ PROGRAM = StudyProgram(
     Path(__file__).parent / "results",
     Plan,
     write_results,
+    most_workers=lambda size: size.most_workers,
 )
 
 

@@ -1,8 +1,8 @@
-"""One job of the study: a whole training run in virtual time."""
+"""One job of the study: a whole training run, in virtual or in real time."""
 
 from __future__ import annotations
 
-import time
+import os
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Any
 
 from common.errors import RelodError
 from deploy.episodes import EpisodeTable
+from experiments.distribution.real_time import launch
 from experiments.run_folders import remove_rebuildable
 from experiments.train import train
 from experiments.training import Training
@@ -75,7 +76,8 @@ def work(settings: Mapping[str, Any], key: Key) -> Mapping[str, Any]:
     """Do a job.
 
     Args:
-        settings: ``runs``: folder of the runs' folders; under :attr:`Job.setting`: what :func:`training_of` takes.
+        settings: ``runs``: folder of the runs' folders; under :attr:`Job.setting`: what :func:`training_of` takes, and
+            ``real_time`` if it is to be run so.
         key: of the job.
 
     Returns:
@@ -85,8 +87,9 @@ def work(settings: Mapping[str, Any], key: Key) -> Mapping[str, Any]:
     """
     job = Job(*key)  # type: ignore[arg-type]  # the keys are made by Job.key
     run_dir = Path(settings["runs"]) / job.folder
-    begun_s = time.process_time()
-    values = train(training_of(job, settings[job.setting], run_dir))
+    begun_s = _core_s()
+    run = settings[job.setting]
+    values = (launch if run.get("real_time") else train)(training_of(job, run, run_dir))
     episodes = EpisodeTable(run_dir).update()
     if values["steps"] != job.steps or values["episodes"] != len(episodes):
         raise DistributionError(
@@ -101,5 +104,10 @@ def work(settings: Mapping[str, Any], key: Key) -> Mapping[str, Any]:
         "lost": values["experience"]["lost"],
         "age_ms": values["action_age_ms"],
         "updates": values["updates"],
-        "core_s": round(time.process_time() - begun_s, 1),
+        "core_s": round(_core_s() - begun_s, 1),
     }
+
+
+def _core_s() -> float:
+    """Processor time of this process and of those that it has started and seen end."""
+    return sum(os.times()[:4])

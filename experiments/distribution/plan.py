@@ -61,6 +61,8 @@ class Plan:
         panel, configuration = self.size.panel_of(job)
         run = asdict(configuration)
         run["overrides"] = [*configuration.overrides, *panel.overrides]
+        if panel.real_time:
+            run["real_time"] = True
         planned = plan_training(training_of(job, run, Path("runs")))
         algorithm = planned.configurations[LEARNER].algorithm
         task = load_task(job.task, "", {}, rng=np.random.default_rng(0))

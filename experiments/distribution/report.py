@@ -43,7 +43,7 @@ def write_report(directory: Path, study: StudyResult, command: str, figures: Seq
     planned = sum(result.panel.seeds for result in study.configurations)
     finished = sum(len(result.runs) for result in study.configurations)
     decisive = ", ".join(f"{name} {version}" for name, version in versions().items() if name in _DECIDE_RUNS)
-    lines = [f"# Distributions in virtual time, size `{study.size.name}`", "", "```", command, "```", ""]
+    lines = [f"# Distributions, size `{study.size.name}`", "", "```", command, "```", ""]
     lines += [f"{finished} of {planned} runs finished. Versions: {decisive}.", "", _READING, ""]
     for panel in study.panels:
         if panel.measured:

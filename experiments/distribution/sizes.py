@@ -8,6 +8,9 @@ from experiments.distribution.configurations import PPO, SAC, Configuration
 from experiments.distribution.jobs import Job
 
 _RUN_S = 1.0
+_LAUNCH_S = 10.0
+_CYCLE_S = 0.04
+"""Of a task in real time."""
 _STEP_S = {"dot_reacher": 0.0013, "visual_dot_reacher": 0.003}
 """Task -> seconds of one core for an action cycle without its update; for expected times."""
 _UPDATE_S = {"dot_reacher": 0.004, "visual_dot_reacher": 0.019}
@@ -31,6 +34,8 @@ class Panel:
     """The learning curves are means over this many steps."""
     overrides: tuple[str, ...] = ()
     """``section.key=value`` for all runs."""
+    real_time: bool = False
+    """Whether the launcher runs them, and not :mod:`experiments.train`."""
 
     def job(self, configuration: Configuration, seed: int) -> Job:
         """One run."""
@@ -62,9 +67,16 @@ class Size:
             if (configuration.name, panel.task, panel.steps) == (job.configuration, job.task, job.steps)
         )
 
+    @property
+    def most_workers(self) -> int | None:
+        """Runs that may go on side by side; None: any number. In real time they would hold each other up."""
+        return 1 if any(panel.real_time for panel in self.panels) else None
+
     def expected_s(self, job: Job) -> float:
         """Seconds that a job takes one core, roughly."""
-        _, configuration = self.panel_of(job)
+        panel, configuration = self.panel_of(job)
+        if panel.real_time:
+            return _LAUNCH_S + job.steps * _CYCLE_S
         step_s = _STEP_S.get(job.task, max(_STEP_S.values()))
         if configuration.algorithm == "sac":
             step_s += _UPDATES_PER_STEP[configuration.host] * _UPDATE_S.get(job.task, max(_UPDATE_S.values()))
@@ -83,4 +95,8 @@ def _ppo(steps: int, seeds: int) -> Panel:
 GLANCE = Size("glance", (_sac("dot_reacher", 3000, 4),))
 SMALL = Size("small", (_sac("dot_reacher", 5000, 20), _ppo(50_000, 5), _sac("visual_dot_reacher", 5000, 5)))
 THESIS = Size("thesis", (_sac("dot_reacher", 10_000, 30), _ppo(100_000, 30), _sac("visual_dot_reacher", 10_000, 10)))
-SIZES = {size.name: size for size in (SMALL, THESIS, GLANCE)}
+REAL = Size(
+    "real",
+    (Panel("real_sac_dot_reacher", "SAC in real time, dot_reacher", "dot_reacher", SAC, 5000, 3, 500, real_time=True),),
+)
+SIZES = {size.name: size for size in (SMALL, THESIS, GLANCE, REAL)}
