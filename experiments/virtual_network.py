@@ -25,6 +25,7 @@ from deploy.network import (
     direction_random,
 )
 from deploy.network.conditions import direction_from
+from deploy.network.link_process import trace_over
 from deploy.network.part import DeviceBytes, DirectionCounts, outages_so_far
 from experiments.simulation import SimulatedClock
 from experiments.virtual_tcp import TcpStream
@@ -61,6 +62,10 @@ class VirtualLink:
         """What the sender's end of a connection can hold."""
         limited = any(self._conditions.direction(name).bytes_per_s for name in DIRECTIONS)
         return LIMITED_BUFFER_BYTES if limited else BUFFER_BYTES
+
+    def over(self) -> str | None:
+        """Why the link is over: a trace that stops. None if it is not."""
+        return trace_over(self._conditions, self._clock.now_ns() - self._start_ns)
 
     def part(self) -> NetworkPart:
         """The link's part of the record."""

@@ -58,9 +58,15 @@ class VirtualRun(InProcessRun):
         super().__init__(configurations, clock, network)
 
     def run(self, look: Callable[[InProcessRun], None]) -> None:
-        """See :class:`InProcessRun`; leaves the link's part of the record."""
+        """See :class:`InProcessRun`; ends with a trace that stops, and leaves the link's part of the record."""
+
+        def look_at_link_too(run: InProcessRun) -> None:
+            look(run)
+            if self._link is not None and (over := self._link.over()):
+                self.stop(over)
+
         try:
-            super().run(look)
+            super().run(look_at_link_too)
         finally:
             if self._link is not None:
                 write_atomically(self._run_dir / "network.json", self._link.part().to_json())

@@ -75,7 +75,7 @@ class LinkProcess:
         if self._process is None:
             return None
         if self._process.poll() is None:
-            return trace_over(self._conditions, self._start_monotonic_ns)
+            return trace_over(self._conditions, time.monotonic_ns() - self._start_monotonic_ns)
         return f"{self._module} ended with exit code {self._process.returncode}: {self._log_tail()}"
 
     def stop(self) -> None:
@@ -116,15 +116,15 @@ class LinkProcess:
         return f"{lines[-1]} (all of it: {self._log_path})" if lines else f"it left nothing in {self._log_path}"
 
 
-def trace_over(conditions: NetworkConditions, start_monotonic_ns: int) -> str | None:
-    """That a trace which stops is over for a link that started then; None if none is.
+def trace_over(conditions: NetworkConditions, age_ns: int) -> str | None:
+    """That a trace which stops is over for a link that started so long ago; None if none is.
 
     The link itself goes on with the last values: the services can still say goodbye.
     """
     if conditions.stops is None:
         return None
     end_s, trace = conditions.stops
-    if time.monotonic_ns() - start_monotonic_ns < end_s * 1e9:
+    if age_ns < end_s * 1e9:
         return None
     return f"the trace {trace.name} is over after {end_s:g} s, and trace_end = 'stop'; 'loop' begins it again"
 

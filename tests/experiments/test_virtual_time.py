@@ -57,6 +57,18 @@ def test_the_same_seed_gives_the_same_run_over_a_bad_network_with_outages(bad, t
         assert (bad / file).read_bytes() == (tmp_path / file).read_bytes(), file
 
 
+def test_a_trace_that_stops_ends_the_run_in_order(tmp_path):
+    trace = tmp_path / "short.csv"
+    trace.write_text("time_s,delay_ms\n0.0,5\n1.0,10\n", encoding="utf-8")  # Each line holds for a second.
+    network = tmp_path / "network.toml"
+    network.write_text(f'[network]\ntrace = "{trace}"\ntrace_end = "stop"\n', encoding="utf-8")
+    values = train(small(tmp_path / "run", network=str(network)))
+    # The link's 2 s of 25 cycles each, less the services' start; looked at once a second.
+    assert 25 <= values["steps"] <= 75
+    assert values["experience"]["lost"] == 0
+    assert "short.csv is over after 2 s" in (tmp_path / "run" / "logs" / "train.log").read_text(encoding="utf-8")
+
+
 def test_another_seed_gives_another_run(bad, tmp_path):
     train(small(tmp_path, *OUTAGES, network="wifi_bad", seed=1, steps=50))
     one, other = ((folder / "network.json").read_bytes() for folder in (bad, tmp_path))
