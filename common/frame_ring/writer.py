@@ -244,8 +244,7 @@ class RingWriter(RingView):
         row["pair"] = before is not None and self._continues(before, row)
         row["transitions"] = row["pair"] + (before["transitions"] if before is not None else 0)
 
-    @staticmethod
-    def _continues(before: np.void, row: np.void) -> bool:
+    def _continues(self, before: np.void, row: np.void) -> bool:
         """True if ``row`` is the experience right after ``before`` in its attempt and both observations are whole."""
         return bool(
             row["whole"]
@@ -256,6 +255,8 @@ class RingWriter(RingView):
             and not (before["terminated"] or before["truncated"])
             # A stop is no action: what it does to the robot cannot be learnt as the effect of one.
             and row["action_source"] != _STOP
+            # With pending actions it is the choice that is learnt from; without one, nothing depended on the policy.
+            and (self._pending is None or row["has_extras"])
         )
 
     def _recount(self) -> None:
