@@ -9,7 +9,7 @@ from common.errors import ConfigError
 
 WEIGHTS_DTYPES = ("float32", "float16")
 MOST_PENDING_ACTIONS = 100
-"""Four seconds of 40 ms: an action that is later than that is applied by no bridge."""
+"""Four seconds at 40 ms a cycle; what comes later should be stopped by the watchdog. Inputs and rows grow with it."""
 
 
 @dataclass(frozen=True)

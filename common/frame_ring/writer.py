@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import mmap
 import os
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 import numpy as np
 
 from common.errors import MessageError, RingError
 from common.frame_ring import layout
+from common.frame_ring.file import create_ring_file, lock_ring_file
 from common.frame_ring.layout import RANGE_DTYPE, SOURCES, Records, RingLayout
 from common.frame_ring.persisted import PersistedRanges
 from common.frame_ring.reader import read_layout
@@ -84,12 +82,12 @@ class RingWriter(RingView):
         wanted = RingLayout.of_task(observed_spec(spec, pending_actions), capacity_rows, frames_per_row)
         try:
             if not os.path.exists(name):
-                _create(name, wanted)
+                create_ring_file(name, wanted)
             descriptor = os.open(name, os.O_RDWR | os.O_CLOEXEC)
         except OSError as error:
             raise RingError(f"{name}: cannot open the experience ring: {error.strerror}") from error
         try:
-            _lock(name, descriptor)
+            lock_ring_file(name, descriptor)
             sizes = read_layout(name, descriptor)
             if sizes != wanted:
                 raise RingError(
@@ -274,34 +272,3 @@ class RingWriter(RingView):
             if self._pending is not None:
                 chosen = row["chosen_action"].copy() if row["has_extras"] else None
                 self._pending.note(step.incarnation, int(row["actor_incarnation"]), step.seq - 1, chosen)
-
-
-def _create(path: str, sizes: RingLayout) -> None:
-    """Make an empty ring; ``path`` appears only when it is complete."""
-    partial = f"{path}.partial"
-    descriptor = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
-    try:
-        # Not a sparse file: a mapped page that finds no room later kills the process without an exception.
-        os.posix_fallocate(descriptor, 0, sizes.file_bytes)
-        os.pwrite(descriptor, sizes.header(), 0)
-        os.fsync(descriptor)
-        os.rename(partial, path)
-    except BaseException as error:
-        os.ftruncate(descriptor, 0)  # gives back what was allocated, or the text below would count it as in use
-        Path(partial).unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
-            room = os.statvfs(os.path.dirname(path) or ".")
-            raise RingError(
-                f"{path}: the experience ring needs {sizes.file_bytes} bytes, {room.f_bavail * room.f_frsize} are free "
-                f"({error.strerror}); make room, choose another run directory, or a smaller replay capacity"
-            ) from error
-        raise
-    finally:
-        os.close(descriptor)
-
-
-def _lock(path: str, descriptor: int) -> None:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise RingError(f"{path}: another process writes this experience ring; stop it first") from error

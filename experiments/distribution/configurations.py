@@ -18,8 +18,8 @@ PPO_ON_LAPTOP = (f"learner.min_update_s={3 * _PPO_UPDATE_S:.2f}",)
 """Slower by as much as the host files say of SAC's updates."""
 
 PENDING = ("algorithm.pending_actions=3",)
-"""Of the answers over wifi_bad 86 % take more than one cycle, 18 % more than two, 4 % more than three, 1 % more than four
-(one run of 3000 steps of Dot-Reacher): nearly all that is on its way was chosen on the last three observations."""
+"""Of the answers over wifi_bad 86 % take more than one cycle, 18 % more than two, 4 % more than three and 1 % more than
+four (one run, 3000 steps of Dot-Reacher): nearly all that is on its way was chosen on the last three observations."""
 
 
 @dataclass(frozen=True)
