@@ -22,7 +22,8 @@ from common.errors import ConfigError, MessageError, RelodError
 from common.frame_encoding import FrameEncoding, encode_frames, pixels_of
 from common.frame_stack import FrameStack
 from common.messages import Float32Array, PolicyWeights, UInt8Array
-from common.policies import Observation, Policy, policy_from_weights
+from common.pending_actions import PendingActions, observed_spec
+from common.policies import Observation, Policy, pending_actions_of, policy_from_weights
 from common.record import write_atomically
 from common.topics import ROBOT_BRIDGE
 from deploy.console import Console
@@ -51,7 +52,7 @@ class EvaluatedEpisode:
 
 @dataclass(frozen=True)
 class _StepIdentity:
-    """What the frame stack wants to know of a time step."""
+    """What frame stack and pending actions want to know of a time step."""
 
     incarnation: int
     seq: int
@@ -69,6 +70,7 @@ class Evaluation:
         rng: np.random.Generator,
         seed: int,
         encoding: FrameEncoding = FrameEncoding.RAW,
+        pending_actions: int = 0,
     ) -> None:
         """Args:
         task: built with ``rng``, its only source of randomness.
@@ -76,6 +78,7 @@ class Evaluation:
         rng: reset for each episode.
         seed: of the episodes' start states.
         encoding: of the camera frames in the run; the policy sees what it leaves of them.
+        pending_actions: that the policy wants to see.
         """
         self._task, self._policy, self._rng, self._seed, self._encoding = task, policy, rng, seed, encoding
         self._ledger = Ledger(task.spec)
@@ -85,6 +88,7 @@ class Evaluation:
         self._stack: FrameStack[UInt8Array] | None = None
         if task.spec.has_camera:
             self._stack = FrameStack(task.spec.frame_stack)
+        self._pending = PendingActions(pending_actions, task.spec.dimensions.A) if pending_actions else None
         task.advance_to(self._now_ns)
 
     def run_episode(self, number: int) -> EvaluatedEpisode:
@@ -130,15 +134,19 @@ class Evaluation:
     def _act(self, previous_action: Float32Array) -> Float32Array:
         """Command the policy's action on what the sensors show now; return what was commanded."""
         spec, reading = self._task.spec, self._task.read()
-        frames = None
+        frames, proprioception = None, reading.proprioception
+        step = _StepIdentity(0, self._seq, self._ledger.attempt, self._ledger.step_index)
         if self._stack:
-            step = _StepIdentity(0, self._seq, self._ledger.attempt, self._ledger.step_index)
             pixels = pixels_of(encode_frames(reading.frames, self._encoding))
             stack = self._stack.add(step, reading.frame_ids.tolist(), list(pixels))
             frames = np.stack(stack.frames) if stack else None
-        self._seq += 1
-        observation = Observation(frames, reading.proprioception, previous_action)
+        if self._pending:
+            proprioception = self._pending.observe(step, proprioception)
+        observation = Observation(frames, proprioception, previous_action)
         chosen = self._policy.act(observation, self._rng, deterministic=True)
+        if self._pending:
+            self._pending.note(step.incarnation, 0, step.seq, chosen.action)
+        self._seq += 1
         action: Float32Array = np.clip(chosen.action, spec.action_low, spec.action_high)
         self._task.command(action)
         return action
@@ -176,7 +184,9 @@ def load_run(run_dir: Path, config_path: Path | None, seed: int) -> tuple[Evalua
     except MessageError as error:
         raise ConfigError(f"{policy_path} cannot be used: {error}") from error
     encoding = FrameEncoding(config.robot_bridge.encoding)
-    return Evaluation(task, policy_from_weights(task.spec, weights), rng, seed, encoding), task, weights
+    pending_actions = pending_actions_of(weights, task.spec)
+    policy = policy_from_weights(observed_spec(task.spec, pending_actions), weights)
+    return Evaluation(task, policy, rng, seed, encoding, pending_actions), task, weights
 
 
 def evaluation_text(episodes: Sequence[EvaluatedEpisode]) -> str:

@@ -24,6 +24,7 @@ from common.algorithms.presets import resolve_config, setting_names
 from common.frame_ring import crop_shape
 from common.messages import TaskSpec
 from common.minibatch import Minibatch
+from common.pending_actions import observed_spec
 from common.policies import Observation, initial_policy
 from common.record import write_atomically
 from common.topics import ACTOR, LEARNER, ROBOT_BRIDGE
@@ -83,6 +84,7 @@ def measure(spec: TaskSpec, learner: Any) -> ComputingTimes:
     config = resolve_config(
         name, learner.algorithm.preset or spec.algorithm_presets.get(name, ""), learner.algorithm.overrides
     )
+    spec = observed_spec(spec, config.pending_actions)
     rng = np.random.default_rng(0)
     policy = initial_policy(spec, config.hidden_size, config.encoder_strides, 0, zero_initialised_head=False)
     observation = _observation(spec, rng)

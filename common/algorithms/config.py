@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from common.errors import ConfigError
 
 WEIGHTS_DTYPES = ("float32", "float16")
+MOST_PENDING_ACTIONS = 100
+"""Four seconds at 40 ms a cycle; what comes later should be stopped by the watchdog. Inputs and rows grow with it."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,9 @@ class AlgorithmConfig:
     """The actor's last layer starts at zero (thesis 4.2, guideline 1 of 7.3); False: at random, as torch would."""
     random_crop: bool = True
     """The frames of a minibatch are cropped at random (thesis 3.6); False: in the middle, as for acting."""
+    pending_actions: int = 0
+    """Actions in an observation that the policy chose before it and that may not have been applied yet
+    (:mod:`common.pending_actions`)."""
     actor_lr: float = 1e-3
     """Adam's step size for the actor."""
     critic_lr: float = 1e-3
@@ -51,6 +56,11 @@ class AlgorithmConfig:
         self._expect_betas("adam_betas")
         strides = self.encoder_strides
         self._expect("encoder_strides", len(strides) == 4 and set(strides) <= {1, 2, 3, 4}, "4 integers in 1..4")
+        self._expect(
+            "pending_actions",
+            0 <= self.pending_actions <= MOST_PENDING_ACTIONS,
+            f"an integer in 0..{MOST_PENDING_ACTIONS}",
+        )
         self._expect("discount", 0.0 <= self.discount <= 1.0, "a number in [0, 1]")
         self._expect("weights_dtype", self.weights_dtype in WEIGHTS_DTYPES, f"one of {list(WEIGHTS_DTYPES)}")
         # At the middle of the bounds, where a zero-initialised layer starts, the standard deviation is exp(0) = 1.

@@ -14,7 +14,7 @@ from common.algorithms.actor_critic import ActorCritic, observation
 from common.algorithms.adam import Adam
 from common.algorithms.base import random_seeds
 from common.algorithms.sac_config import SACConfig
-from common.messages import TaskSpec
+from common.messages import Float32Array, TaskSpec
 from common.minibatch import Minibatch
 from common.networks.distribution import TanhGaussian
 from common.networks.mlp import TwinQ
@@ -55,7 +55,9 @@ class SAC(ActorCritic):
     - The target critics have a target encoder of their own (``encoder_tau``).
     - Only ``terminated`` cuts the bootstrap. A time limit is not part of the task, so its last observation has a
       value like any other.
-    - It learns from the applied action, clipped and delayed as it may be, not from the one the policy chose.
+    - It learns from the applied action, clipped and delayed as it may be, not from the one the policy chose. With
+      pending actions it is the other way round: the applied one is among them, so the observation says already what
+      it does, and the chosen one is the first of the next observation's.
     """
 
     NAME = "sac"
@@ -157,6 +159,9 @@ class SAC(ActorCritic):
         distribution = TanhGaussian.from_head(mean, log_std, config.log_std_low, config.log_std_high)
         return distribution.act(self._noise(*mean.shape))
 
+    def _learnt_action(self, minibatch: Minibatch) -> Float32Array:
+        return minibatch.chosen_action if self._config.pending_actions else minibatch.action
+
     def _state(self) -> dict[str, Tensor]:
         return {**super()._state(), "log_temperature": self.log_temperature}
 
@@ -165,7 +170,7 @@ class SAC(ActorCritic):
         return _Batch(
             frames=None if minibatch.frames is None else to_tensor(minibatch.frames),
             vector=self._vector(minibatch.proprioception, minibatch.previous_action),
-            action=to_tensor(self._actions.to_unit(minibatch.action, self._float)),
+            action=to_tensor(self._actions.to_unit(self._learnt_action(minibatch), self._float)),
             reward=to_tensor(minibatch.reward.astype(self._float)),
             terminated=to_tensor(minibatch.terminated.astype(self._float)),
             next_frames=None if minibatch.next_frames is None else to_tensor(minibatch.next_frames),

@@ -86,7 +86,7 @@ class RingLayout:
                 ("policy_version", "<i8"),
                 ("action_applied_ns", "<i8"),
                 ("published_ns", "<i8"),
-                ("proprioception", "<f4", (self.proprioception_size,)),
+                ("proprioception", "<f4", (self.proprioception_size,)),  # ends with the pending actions, if there are
                 ("action", "<f4", (self.action_size,)),  # applied
                 ("chosen_action", "<f4", (self.action_size,)),
                 ("log_probability", "<f4"),
@@ -96,7 +96,7 @@ class RingLayout:
                 ("terminated", "u1"),
                 ("truncated", "u1"),
                 ("new_frames", "u1"),  # frames at the end of "stack" that came with this experience
-                ("whole", "u1"),  # "stack" is what the task asks for, or the task has no camera
+                ("whole", "u1"),  # the observation is what the policy saw: nothing of it was lost
                 ("pair", "u1"),  # row - 1 is the experience just before: this row ends a transition
             ],
             align=True,

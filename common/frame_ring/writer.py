@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import mmap
 import os
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from common.errors import MessageError, RingError
 from common.frame_ring import layout
+from common.frame_ring.file import create_ring_file, lock_ring_file
 from common.frame_ring.layout import RANGE_DTYPE, SOURCES, Records, RingLayout
 from common.frame_ring.persisted import PersistedRanges
 from common.frame_ring.reader import read_layout
 from common.frame_ring.view import RingView
 from common.frame_stack import FrameStack, Stack
-from common.messages import ActionSource, Experience, TaskSpec
+from common.messages import ActionSource, Experience, Float32Array, TaskSpec, TimeStep
+from common.pending_actions import PendingActions, observed_spec
 
 _STOP = SOURCES.index(ActionSource.STOP)
 FRAME_MEMORY = 256
@@ -44,7 +43,7 @@ class RingWriter(RingView):
     loses power may leave rows appended since the last :meth:`flush` in any condition.)
     """
 
-    def __init__(self, sizes: RingLayout, mapped: mmap.mmap, file_descriptor: int) -> None:
+    def __init__(self, sizes: RingLayout, mapped: mmap.mmap, file_descriptor: int, pending_actions: int = 0) -> None:
         """Go on writing a mapped ring; takes over the file descriptor, whose lock it keeps until closed."""
         super().__init__(sizes, mapped)
         self._file_descriptor = file_descriptor
@@ -52,13 +51,20 @@ class RingWriter(RingView):
         self._persisted = PersistedRanges(table)
         self._scratch: Records = np.zeros(1, sizes.row_dtype)
         self._stack = FrameStack[int](sizes.frame_stack, FRAME_MEMORY) if sizes.frame_stack else None
+        self._sensed_size = sizes.proprioception_size - pending_actions * sizes.action_size
+        self._pending = PendingActions(pending_actions, sizes.action_size) if pending_actions else None
         # A frame whose writing was cut off has spoilt its slot: its number is skipped, never used again.
         self._counters[layout.FRAMES_DONE] = self._counters[layout.FRAMES_BEGUN]
         self._recount()
 
     @classmethod
     def create_or_reopen(
-        cls, path: str | os.PathLike[str], spec: TaskSpec, capacity_rows: int, frames_per_row: float = 1.25
+        cls,
+        path: str | os.PathLike[str],
+        spec: TaskSpec,
+        capacity_rows: int,
+        frames_per_row: float = 1.25,
+        pending_actions: int = 0,
     ) -> RingWriter:
         """Open the ring at ``path``, which is created if it is not there.
 
@@ -67,27 +73,28 @@ class RingWriter(RingView):
             spec: task whose experiences it holds.
             capacity_rows: experiences before the oldest is overwritten.
             frames_per_row: camera frames reserved for each row.
+            pending_actions: of an observation (:mod:`common.pending_actions`); a row's proprioception ends with them.
 
         Raises:
             RingError: no room on the disk, a ring of another layout, another writer, or no access.
         """
         name = os.fspath(path)
-        wanted = RingLayout.of_task(spec, capacity_rows, frames_per_row)
+        wanted = RingLayout.of_task(observed_spec(spec, pending_actions), capacity_rows, frames_per_row)
         try:
             if not os.path.exists(name):
-                _create(name, wanted)
+                create_ring_file(name, wanted)
             descriptor = os.open(name, os.O_RDWR | os.O_CLOEXEC)
         except OSError as error:
             raise RingError(f"{name}: cannot open the experience ring: {error.strerror}") from error
         try:
-            _lock(name, descriptor)
+            lock_ring_file(name, descriptor)
             sizes = read_layout(name, descriptor)
             if sizes != wanted:
                 raise RingError(
                     f"{name}: an experience ring of another layout: {sizes.differences(wanted)}; "
                     "choose another run directory or restore the settings it was made with"
                 )
-            return cls(sizes, mmap.mmap(descriptor, sizes.file_bytes), descriptor)
+            return cls(sizes, mmap.mmap(descriptor, sizes.file_bytes), descriptor, pending_actions)
         except BaseException:
             os.close(descriptor)
             raise
@@ -137,6 +144,7 @@ class RingWriter(RingView):
             ids = step.frame_ids[len(step.frame_ids) - new :]
             stack = self._stack.add(step, ids, range(first_frame, first_frame + new))
         self._fill_stack(stack, new)
+        self._fill_relation(step)
 
         counters = self._counters
         counters[layout.ROWS_BEGUN] = number + 1
@@ -159,6 +167,9 @@ class RingWriter(RingView):
         super().close()
         os.close(self._file_descriptor)
 
+    def _last_row(self) -> np.void | None:
+        return self._row(self.rows_appended - 1) if self.rows_appended else None
+
     def _row(self, number: int) -> np.void:
         row: np.void = self._rows[number % self.layout.capacity_rows]
         return row
@@ -166,7 +177,7 @@ class RingWriter(RingView):
     def _check(self, experience: Experience) -> None:
         sizes, step, extras = self.layout, experience.time_step, experience.extras
         arrays = [
-            ("proprioception", step.proprioception, (sizes.proprioception_size,)),
+            ("proprioception", step.proprioception, (self._sensed_size,)),
             ("action", step.action, (sizes.action_size,)),
         ]
         if extras:
@@ -196,16 +207,24 @@ class RingWriter(RingView):
             if not abs(value) <= LARGEST_REAL:  # nan too
                 raise MessageError(f"TimeStep {step.seq}: {name} {value} is no finite 32-bit number")
             row[name] = value
-        row["proprioception"], row["action"] = step.proprioception, step.action
+        row["proprioception"], row["action"] = self._observe(experience), step.action
         row["action_source"] = SOURCES.index(step.action_source)
         row["terminated"], row["truncated"] = step.terminated, step.truncated
         row["has_extras"] = extras is not None
         row["chosen_action"] = extras.chosen_action if extras else 0.0
 
+    def _observe(self, experience: Experience) -> Float32Array:
+        """The proprioception as the policy saw it."""
+        step, extras = experience.time_step, experience.extras
+        if self._pending is None:
+            return step.proprioception
+        chosen = extras.chosen_action if extras else None
+        self._pending.note(step.incarnation, experience.actor_incarnation, step.seq - 1, chosen)
+        return self._pending.observe(step, step.proprioception)
+
     def _fill_stack(self, stack: Stack[int] | None, new: int) -> None:
-        """Complete the row in scratch memory: its frames, and what it is to the row before."""
-        row, number, frames_end = self._scratch[0], self.rows_appended, self.frames_appended + new
-        before = self._row(number - 1) if number else None
+        """Enter the row's frames in scratch memory."""
+        row, before, frames_end = self._scratch[0], self._last_row(), self.frames_appended + new
         bound = before["oldest_frame_bound"] if before is not None else 0
         oldest = min(stack.frames) if stack else frames_end
         row["stack"] = stack.frames if stack else -1
@@ -214,12 +233,17 @@ class RingWriter(RingView):
         row["oldest_frame_bound"] = max(bound, oldest) if stack else bound
         row["new_frames"] = new
         row["whole"] = self._stack is None or (stack is not None and stack.whole)
+
+    def _fill_relation(self, step: TimeStep) -> None:
+        """Complete the row in scratch memory: what it is to those before."""
+        row, before = self._scratch[0], self._last_row()
+        if self._pending:
+            row["whole"] &= self._pending.is_certain(step)
         row["pair"] = before is not None and self._continues(before, row)
         row["transitions"] = row["pair"] + (before["transitions"] if before is not None else 0)
 
-    @staticmethod
-    def _continues(before: np.void, row: np.void) -> bool:
-        """True if ``row`` is the experience right after ``before`` in its attempt and both have whole stacks."""
+    def _continues(self, before: np.void, row: np.void) -> bool:
+        """True if ``row`` is the experience right after ``before`` in its attempt and both observations are whole."""
         return bool(
             row["whole"]
             and before["whole"]
@@ -229,51 +253,22 @@ class RingWriter(RingView):
             and not (before["terminated"] or before["truncated"])
             # A stop is no action: what it does to the robot cannot be learnt as the effect of one.
             and row["action_source"] != _STOP
+            # With pending actions it is the choice that is learnt from; without one, nothing depended on the policy.
+            and (self._pending is None or row["has_extras"])
         )
 
     def _recount(self) -> None:
-        """Take up where the last writer was: what is persisted, and the frames of the stack."""
+        """Take up where the last writer was: what is persisted, the frames of the stack, and what was chosen."""
         end = self.rows_appended
         if end:  # the last one may have been stored but not yet entered into the table
             self._persisted.add(int(self._row(end - 1)["incarnation"]), int(self._row(end - 1)["seq"]))
-        if self._stack is None:
-            return
         first, _ = self.live_rows()
         for number in range(max(first, end - FRAME_MEMORY), end):
             row = self._row(number)
-            names = ("incarnation", "seq", "attempt", "step_index")
-            new = int(row["new_frames"])
-            known = self.layout.frame_stack - new
-            step = _StoredStep(**{name: int(row[name]) for name in names})
-            self._stack.add(step, row["frame_ids"][known:], [int(n) for n in row["stack"][known:]])
-
-
-def _create(path: str, sizes: RingLayout) -> None:
-    """Make an empty ring; ``path`` appears only when it is complete."""
-    partial = f"{path}.partial"
-    descriptor = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
-    try:
-        # Not a sparse file: a mapped page that finds no room later kills the process without an exception.
-        os.posix_fallocate(descriptor, 0, sizes.file_bytes)
-        os.pwrite(descriptor, sizes.header(), 0)
-        os.fsync(descriptor)
-        os.rename(partial, path)
-    except BaseException as error:
-        os.ftruncate(descriptor, 0)  # gives back what was allocated, or the text below would count it as in use
-        Path(partial).unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
-            room = os.statvfs(os.path.dirname(path) or ".")
-            raise RingError(
-                f"{path}: the experience ring needs {sizes.file_bytes} bytes, {room.f_bavail * room.f_frsize} are free "
-                f"({error.strerror}); make room, choose another run directory, or a smaller replay capacity"
-            ) from error
-        raise
-    finally:
-        os.close(descriptor)
-
-
-def _lock(path: str, descriptor: int) -> None:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise RingError(f"{path}: another process writes this experience ring; stop it first") from error
+            step = _StoredStep(*(int(row[field.name]) for field in fields(_StoredStep)))
+            if self._stack is not None:
+                known = self.layout.frame_stack - int(row["new_frames"])
+                self._stack.add(step, row["frame_ids"][known:], [int(n) for n in row["stack"][known:]])
+            if self._pending is not None:
+                chosen = row["chosen_action"].copy() if row["has_extras"] else None
+                self._pending.note(step.incarnation, int(row["actor_incarnation"]), step.seq - 1, chosen)

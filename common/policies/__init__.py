@@ -14,6 +14,7 @@ from common.policies.weights import (
     initial_parameters,
     pack_weights,
     parameter_shapes,
+    pending_actions_of,
     unpack_weights,
 )
 
@@ -23,6 +24,7 @@ __all__ = [
     "Policy",
     "initial_policy",
     "pack_weights",
+    "pending_actions_of",
     "policy_from_weights",
 ]
 

@@ -5,7 +5,8 @@ Names and shapes (A actions, P proprioception, H hidden size, K = 3 * 3 convolut
     encoder.0.weight  (32, S * C, 3, 3)    only with a camera
     encoder.0.bias    (32,)
     encoder.1 ... encoder.3                 the last without bias, which a spatial softmax cannot see
-    actor.0.weight    (H, [64] + P + A)     observation: encoder features, proprioception, previous action
+    actor.0.weight    (H, [64] + P + A)     observation: encoder features, proprioception, previous action; P with the
+                                            pending actions, if there are
     actor.0.bias      (H,)
     actor.1.weight    (H, H)
     actor.1.bias      (H,)
@@ -28,6 +29,7 @@ from common.errors import MessageError
 from common.messages import Float32Array, PolicyWeights, TaskSpec
 from common.networks.sizes import CHANNELS, FEATURES, KERNEL
 
+_FIRST_WEIGHT = "actor.0.weight"
 _HEAD_WEIGHT, _HEAD_BIAS = "actor.2.weight", "actor.2.bias"
 _WIRE_DTYPES: dict[str, np.dtype[Any]] = {"float32": np.dtype("<f4"), "float16": np.dtype("<f2")}
 
@@ -52,6 +54,13 @@ def parameter_shapes(spec: TaskSpec, hidden_size: int, encoder_strides: Sequence
         shapes[f"actor.{layer}.bias"] = [rows]
     shapes["log_std_bounds"] = [2]
     return shapes
+
+
+def pending_actions_of(weights: PolicyWeights, spec: TaskSpec) -> int:
+    """Return how many pending actions a policy of the task wants to see (:mod:`common.pending_actions`)."""
+    got = dict(zip(weights.names, weights.shapes, strict=False)).get(_FIRST_WEIGHT, [])
+    _, without = parameter_shapes(spec, weights.hidden_size, weights.encoder_strides.tolist())[_FIRST_WEIGHT]
+    return max(0, got[-1] - without) // spec.dimensions.A if got else 0
 
 
 def initial_parameters(

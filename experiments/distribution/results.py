@@ -160,8 +160,12 @@ class StudyResult:
 
     @property
     def configurations(self) -> list[ConfigurationResult]:
-        """Of all panels."""
-        return [result for panel in self.panels for result in panel.configurations]
+        """Of all panels, each once: two may show the same runs."""
+        results: dict[tuple[str, str, int], ConfigurationResult] = {}
+        for panel in self.panels:
+            for result in panel.configurations:
+                results.setdefault((result.configuration.name, result.panel.task, result.panel.steps), result)
+        return list(results.values())
 
 
 def collect(size: Size, rows: Mapping[Key, Row], failures: Mapping[Key, str]) -> StudyResult:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from experiments.distribution.configurations import PPO, SAC, Configuration
+from experiments.distribution.configurations import PPO, SAC, SAC_PENDING, Configuration
 from experiments.distribution.jobs import Job
 
 _RUN_S = 1.0
@@ -50,13 +50,14 @@ class Size:
     panels: tuple[Panel, ...]
 
     def jobs(self) -> list[Job]:
-        """All runs, seed by seed, so that a part of a panel has all configurations."""
-        return [
+        """All runs, each once, seed by seed, so that a part of a panel has all configurations."""
+        every = (
             panel.job(configuration, seed)
             for panel in self.panels
             for seed in range(panel.seeds)
             for configuration in panel.configurations
-        ]
+        )
+        return list(dict.fromkeys(every))
 
     def panel_of(self, job: Job) -> tuple[Panel, Configuration]:
         """Where a job belongs."""
@@ -87,14 +88,38 @@ def _sac(task: str, steps: int, seeds: int) -> Panel:
     return Panel(f"sac_{task}", f"SAC, {task}", task, SAC, steps, seeds, window=500)
 
 
+def _pending(task: str, steps: int, seeds: int) -> Panel:
+    """The ablation beside what it is held against; those runs are the same as in :func:`_sac`."""
+    without = {pending.name.removesuffix("_pending") for pending in SAC_PENDING}
+    configurations = tuple(c for c in SAC if c.name in without) + SAC_PENDING
+    title = f"SAC with and without pending actions, {task}"
+    return Panel(f"sac_pending_{task}", title, task, configurations, steps, seeds, window=500)
+
+
 def _ppo(steps: int, seeds: int) -> Panel:
     return Panel("ppo_dot_reacher", "PPO, dot_reacher", "dot_reacher", PPO, steps, seeds, window=2000)
 
 
 # Too short and too few to tell configurations apart that are close to each other.
 GLANCE = Size("glance", (_sac("dot_reacher", 3000, 4),))
-SMALL = Size("small", (_sac("dot_reacher", 5000, 20), _ppo(50_000, 5), _sac("visual_dot_reacher", 5000, 5)))
-THESIS = Size("thesis", (_sac("dot_reacher", 10_000, 30), _ppo(100_000, 30), _sac("visual_dot_reacher", 10_000, 10)))
+SMALL = Size(
+    "small",
+    (
+        _sac("dot_reacher", 5000, 20),
+        _ppo(50_000, 5),
+        _sac("visual_dot_reacher", 5000, 5),
+        _pending("dot_reacher", 5000, 20),
+    ),
+)
+THESIS = Size(
+    "thesis",
+    (
+        _sac("dot_reacher", 10_000, 30),
+        _ppo(100_000, 30),
+        _sac("visual_dot_reacher", 10_000, 10),
+        _pending("dot_reacher", 10_000, 30),
+    ),
+)
 REAL = Size(
     "real",
     (Panel("real_sac_dot_reacher", "SAC in real time, dot_reacher", "dot_reacher", SAC, 5000, 3, 500, real_time=True),),

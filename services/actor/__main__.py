@@ -9,6 +9,7 @@ from threadpoolctl import threadpool_limits
 from common import topics
 from common.algorithms.presets import resolve_config
 from common.cpu_tuning import keep_freed_memory
+from common.pending_actions import observed_spec
 from common.policies import initial_policy
 from common.priority import ACTOR_PRIORITY, run_before_others
 from common.run_service import end_process, run_service
@@ -36,13 +37,13 @@ def serve(service: Service, config: ActorConfig) -> None:
         name, config.algorithm.preset or spec.algorithm_presets.get(name, ""), config.algorithm.overrides
     )
     policy = initial_policy(
-        spec,
+        observed_spec(spec, algorithm.pending_actions),
         algorithm.hidden_size,
         algorithm.encoder_strides,
         config.run.seed,
         zero_initialised_head=algorithm.zero_initialised_head,
     )
-    actor = Actor(service, spec, policy, config.actor)
+    actor = Actor(service, spec, policy, config.actor, pending_actions=algorithm.pending_actions)
     if config.actor.real_time_priority and spec.pacing == "realtime":
         # Not before torch has been imported, which is seconds of computing.
         logger.info("%s", run_before_others(ACTOR_PRIORITY))

@@ -2,7 +2,7 @@
 
 ::
 
-    TimeStep ─▶ newest? ─▶ frame stack ─▶ policy ─▶ Action          (this loop)
+    TimeStep ─▶ newest? ─▶ observation ─▶ policy ─▶ Action          (this loop)
         └────▶ in order, once, with extras ─▶ Experience            (services.actor.forwarding)
 """
 
@@ -19,6 +19,7 @@ from common.errors import MessageError
 from common.frame_stack import FrameStack, Stack
 from common.inbox import Arrived, Inbox
 from common.messages import Action, PolicyExtras, TaskSpec, TimeStep, UInt8Array
+from common.pending_actions import PendingActions, observed_spec
 from common.policies.base import ChosenAction, Observation, Policy
 from common.service import Service
 from services.actor.config import ActorSettings
@@ -42,11 +43,26 @@ class Computed:
 class Actor:
     """Acts with the newest policy on the newest observation until the run is finished."""
 
-    def __init__(self, service: Service, spec: TaskSpec, initial: Policy, settings: ActorSettings) -> None:
+    def __init__(
+        self,
+        service: Service,
+        spec: TaskSpec,
+        initial: Policy,
+        settings: ActorSettings,
+        *,
+        pending_actions: int = 0,
+    ) -> None:
+        """Args:
+        service: the process's.
+        spec: the task, as the bridge tells it.
+        initial: what acts until a policy comes.
+        settings: of the actor.
+        pending_actions: of the algorithm.
+        """
         self._service, self._spec, self._settings = service, spec, settings
         self._rng = np.random.default_rng([service.run.seed, service.incarnation])
         self._forwarder = ExperienceForwarder(service, settings)
-        self._swap = PolicySwap(service, spec, initial)
+        self._swap = PolicySwap(service, observed_spec(spec, pending_actions), initial)
         self._action_publisher = service.transport.publisher(topics.ACTION)
         self._time_steps, self._resent = (
             Inbox(
@@ -62,6 +78,7 @@ class Actor:
             for topic in (topics.TIME_STEP, topics.TIME_STEP_RESENT)
         )
         self._stack: FrameStack[UInt8Array] | None = FrameStack(spec.frame_stack) if spec.has_camera else None
+        self._pending = PendingActions(pending_actions, spec.dimensions.A) if pending_actions else None
         self._newest: tuple[int, int] = (-1, -1)
         self._last_answer = b""
         self._unanswered: tuple[Arrived[TimeStep], Observation] | None = None
@@ -137,8 +154,10 @@ class Actor:
         if newest.message.is_last or (stack is None and self._spec.has_camera):
             return
         frames = np.stack(stack.frames) if stack else None
-        observation = Observation(frames, newest.message.proprioception, newest.message.action)
-        self._unanswered = newest, observation
+        proprioception = newest.message.proprioception
+        if self._pending:
+            proprioception = self._pending.observe(newest.message, proprioception)
+        self._unanswered = newest, Observation(frames, proprioception, newest.message.action)
 
     def _act(self) -> None:
         """Answer with what has been computed, if it is due; only then compute the next action."""
@@ -163,6 +182,8 @@ class Actor:
             self._answer(computed)
         else:
             self._computed = computed
+        # Not only when it is sent: the next TimeStep may come before, and its Experience must know of it.
+        self._remember(computed)
 
     def _answer(self, computed: Computed) -> None:
         time_step, chosen = computed.arrived.message, computed.chosen
@@ -187,8 +208,13 @@ class Actor:
         self._actions += 1
         if _order(time_step) == self._newest:
             self._last_answer = answer
+
+    def _remember(self, computed: Computed) -> None:
+        time_step, chosen = computed.arrived.message, computed.chosen
         extras = PolicyExtras(chosen.action, chosen.log_probability, computed.policy_version)
         self._forwarder.remember_answer(time_step, extras)
+        if self._pending:
+            self._pending.note(time_step.incarnation, self._service.incarnation, time_step.seq, chosen.action)
 
     def _wait_for_updates(self) -> None:
         """In lockstep the world waits until the learner has spent the budget."""

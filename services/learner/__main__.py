@@ -28,6 +28,7 @@ def serve(service: Service, config: LearnerConfig) -> None:
     from common.algorithms.presets import resolve_config
     from common.cpu_tuning import tune_process
     from common.frame_ring import RING_FILE, RingReader
+    from common.pending_actions import observed_spec
     from services.learner.checkpoint import restore
     from services.learner.device import open_device, too_little_memory_explained
     from services.learner.device_frames import DeviceRingReader
@@ -42,6 +43,7 @@ def serve(service: Service, config: LearnerConfig) -> None:
         return
     preset = config.algorithm.preset or spec.algorithm_presets.get(name, "")
     algorithm_config = resolve_config(name, preset, config.algorithm.overrides)
+    spec = observed_spec(spec, algorithm_config.pending_actions)
     directory = Path(config.run.directory)
     with too_little_memory_explained(device):
         algorithm = algorithm_class(

@@ -143,11 +143,25 @@ class MappedMinibatches(MinibatchSource):
 
     def _gather(self, message: RowMinibatch) -> Minibatch | None:
         try:
-            ring = self._ring = self._ring or self._open_ring(self._path)
+            ring = self._ring = self._ring or self._open()
         except RingError as error:
-            self._service.refusals.refuse(topics.ROW_MINIBATCH.name, f"{error}; is replay on this computer?")
+            self._service.refusals.refuse(topics.ROW_MINIBATCH.name, error)
             return None
         return drop_overtaken(ring.gather(message.rows, self._crop_shape, self._draw_crop()))
+
+    def _open(self) -> RingReader:
+        try:
+            ring = self._open_ring(self._path)
+        except RingError as error:
+            raise RingError(f"{error}; is replay on this computer?") from error
+        got, expected = ring.layout.proprioception_size, self._spec.dimensions.P
+        if got != expected:
+            ring.close()
+            raise RingError(
+                f"{self._path}: observations of {got} numbers, expected {expected}; "
+                "is algorithm.pending_actions the same for replay and learner?"
+            )
+        return ring
 
 
 class ReceivedMinibatches(MinibatchSource):

@@ -42,7 +42,11 @@ class Replay:
     def __init__(self, service: Service, spec: TaskSpec, algorithm: AlgorithmConfig, settings: ReplaySettings) -> None:
         self._service, self._settings = service, settings
         self._ring = RingWriter.create_or_reopen(
-            Path(service.run.directory) / RING_FILE, spec, algorithm.replay_capacity, settings.frames_per_row
+            Path(service.run.directory) / RING_FILE,
+            spec,
+            algorithm.replay_capacity,
+            settings.frames_per_row,
+            algorithm.pending_actions,
         )
         self._persisted = self._ring.persisted_counts()
         self._transitions = self._ring.transitions_appended

@@ -9,6 +9,7 @@ import tomli_w
 from common.codec import encode
 from common.frame_encoding import FrameEncoding, encode_frames, pixels_of
 from common.messages import TaskSpec
+from common.pending_actions import observed_spec
 from common.policies import ChosenAction, Observation, pack_weights
 from common.policies.weights import initial_parameters
 from deploy import evaluate
@@ -115,7 +116,7 @@ def test_the_text_tells_mean_error_and_time_outs() -> None:
     assert "± " not in evaluation_text(episodes[:1])
 
 
-def write_run(run_dir: Path) -> TaskSpec:
+def write_run(run_dir: Path, pending_actions: int = 0) -> TaskSpec:
     """A run whose policy is the initial one."""
     tables = {
         "run": {"id": "run1", "directory": str(run_dir)},
@@ -126,7 +127,7 @@ def write_run(run_dir: Path) -> TaskSpec:
     (run_dir / "config" / "robot_bridge.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
     spec = load_task("dot_reacher", rng=np.random.default_rng(0)).spec
     weights = pack_weights(
-        initial_parameters(spec, 16, (), np.random.default_rng(0)),
+        initial_parameters(observed_spec(spec, pending_actions), 16, (), np.random.default_rng(0)),
         version=3,
         updates=150,
         algorithm="sac",
@@ -138,8 +139,11 @@ def write_run(run_dir: Path) -> TaskSpec:
     return spec
 
 
-def test_the_command_evaluates_a_run_with_its_settings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_run(tmp_path)
+@pytest.mark.parametrize("pending_actions", [0, 3])
+def test_the_command_evaluates_a_run_with_its_settings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], pending_actions: int
+) -> None:
+    write_run(tmp_path, pending_actions)
     assert evaluate.main([str(tmp_path), "--episodes", "2"]) == 0
     out = capsys.readouterr().out
     assert "policy 3, 150 updates" in out
@@ -166,3 +170,29 @@ def test_a_damaged_policy_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
     (tmp_path / "policy.msgpack").write_bytes(b"\x00")
     assert evaluate.main([str(tmp_path)]) == 1
     assert "PolicyWeights" in capsys.readouterr().err
+
+
+class Remembering:
+    """Chooses another action each time, far inside the bounds; keeps what it sees."""
+
+    version = 1
+
+    def __init__(self) -> None:
+        self.proprioceptions: list[list[float]] = []
+        self.chosen: list[list[float]] = []
+
+    def act(self, observation: Observation, rng: np.random.Generator, deterministic: bool = False) -> ChosenAction:
+        self.proprioceptions.append(observation.proprioception.tolist())
+        action = np.array([len(self.chosen) + 1, 0], np.float32) / 1024
+        self.chosen.append(action.tolist())
+        return ChosenAction(action, 0.0)
+
+
+def test_a_policy_that_wants_its_pending_actions_sees_those_of_the_attempt() -> None:
+    policy, rng = Remembering(), np.random.default_rng(0)
+    task = load_task("dot_reacher", overrides={"time_limit": 3, "reset_steps": 0}, rng=rng)
+    Evaluation(task, policy, rng, 0, pending_actions=2).run_episode(0)
+    zeros, chosen = [0.0, 0.0], policy.chosen
+    expected = [zeros + zeros, chosen[0] + zeros, chosen[1] + chosen[0], zeros + zeros, chosen[3] + zeros]
+    assert [seen[4:] for seen in policy.proprioceptions[:5]] == expected
+    assert all(len(seen) == 4 + 2 * 2 for seen in policy.proprioceptions)

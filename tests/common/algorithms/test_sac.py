@@ -166,3 +166,15 @@ def test_a_random_state_that_is_none_is_refused(wrong):
     sac = SAC(SPEC, CONFIG, seed=0)
     with pytest.raises(ConfigError, match=r"random_state: expected \[5056\]"):
         sac.load_state_dict(sac.state_dict() | {"random_state": wrong})
+
+
+def test_with_pending_actions_it_learns_from_the_chosen_action_and_without_from_the_applied_one():
+    minibatch = make_minibatch(SPEC, np.random.default_rng(0), 8)
+    otherwise_applied = replace(minibatch, action=-minibatch.action, terminated=np.ones(8, np.float32))
+    minibatch = replace(minibatch, terminated=np.ones(8, np.float32))
+    otherwise_chosen = replace(minibatch, chosen_action=-minibatch.chosen_action)
+    # At the end of an episode nothing follows, so the applied action is no part of what comes next either.
+    assert critic_loss(minibatch) == critic_loss(otherwise_chosen) != critic_loss(otherwise_applied)
+    config = replace(CONFIG, pending_actions=1)
+    assert critic_loss(minibatch, config) == critic_loss(otherwise_applied, config)
+    assert critic_loss(minibatch, config) != critic_loss(otherwise_chosen, config)

@@ -1,6 +1,7 @@
 """From runs to numbers, worked out by hand."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -83,3 +84,14 @@ def test_every_run_has_a_row_also_one_that_crashed():
     assert len(table) == 6
     assert [row["status"] for row in table] == ["finished"] * 5 + ["crashed: why"]
     assert {row["runs"] for row in curve_rows(study)} == {2, 3}
+
+
+def test_runs_that_two_panels_show_are_made_and_counted_once():
+    (first,) = HAND_MADE.panels
+    shared = replace(HAND_MADE, panels=(first, replace(first, name="again", configurations=first.configurations[:1])))
+    assert shared.jobs() == HAND_MADE.jobs()
+    study = collect(shared, rows(), {})
+    assert [len(panel.measured) for panel in study.panels] == [2, 1]
+    assert study.panels[1].measured[0].runs == study.panels[0].measured[0].runs
+    assert run_rows(study) == run_rows(collect(HAND_MADE, rows(), {}))
+    assert curve_rows(study) == curve_rows(collect(HAND_MADE, rows(), {}))

@@ -37,12 +37,14 @@ class TellingPolicy:
 class Scene:
     """The actor, not running: tests call ``take`` for a round of its loop."""
 
-    def __init__(self, directory, spec=None, clock=None, **settings) -> None:
+    def __init__(self, directory, spec=None, clock=None, pending_actions=0, **settings) -> None:
         self.spec = spec or make_spec()
         self.network = InMemoryNetwork()
         self.service = SoloService(topics.ACTOR, self.network, directory, clock, incarnation=ACTOR)
         self.policy = TellingPolicy()
-        self.actor = Actor(self.service, self.spec, self.policy, ActorSettings(**settings))
+        self.actor = Actor(
+            self.service, self.spec, self.policy, ActorSettings(**settings), pending_actions=pending_actions
+        )
         self.peer = Peer(self.network)
         self.actions = self.peer.messages(topics.ACTION)
         self.experiences = self.peer.messages(topics.EXPERIENCE)

@@ -94,6 +94,14 @@ def rows_of(minibatch):
     return minibatch.next_proprioception[:, 0].astype(int).tolist()
 
 
+def test_a_ring_with_other_observations_than_the_learner_s_is_refused_with_the_reason(mapped, caplog):
+    mapped.ring = RingWriter.create_or_reopen(mapped.path, task_spec(), CAPACITY, pending_actions=2)
+    mapped.fill(3)
+    mapped.send_rows(0, [1])
+    eventually(lambda: mapped.source.dropped == 1)
+    assert "observations of 6 numbers, expected 2; is algorithm.pending_actions the same" in caplog.text
+
+
 # ---------------------------------------------------------------------- credit
 
 
