@@ -274,10 +274,13 @@ class JournalSender:
         return self._retained.given_up
 
     def put(self, seq: int, payload: bytes) -> None:
-        """Retain and publish message ``seq``."""
-        with self._lock:
-            self._retained.retain(seq, payload, self._clock.now_ns())
-        self._publisher.put(payload)
+        """Publish and retain message ``seq``."""
+        try:
+            self._publisher.put(payload)
+        finally:
+            # While it is on its way: whoever waits for it need not wait for that.
+            with self._lock:
+                self._retained.retain(seq, payload, self._clock.now_ns())
 
     def republish(self, payload: bytes) -> None:
         """Publish once more what :meth:`put` has published."""
