@@ -6,7 +6,7 @@ the sender resends that, paced, below everything else. So the newest message is 
 short network outage costs freshness only while it lasts.
 
     sender                                            receiver
-      retain(seq, payload) ; put  ── message ───────▶   accept
+      put ; retain(seq, payload)  ── message ───────▶   accept
       head() every 0.2 s          ── StreamHead ────▶   note_head        what exists, what can still be resent
       acknowledge                 ◀─ Acknowledgement    acknowledgement  what is done, what is missing
       due() ; put on `resent`     ── message ───────▶   accept
