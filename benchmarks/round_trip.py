@@ -102,9 +102,11 @@ def ours(resources: ExitStack) -> Prepared:
     def trip(observation: dict[str, Any]) -> None:
         seq = observation["seq"]
         journal.put(seq, encode(TimeStep(**observation)))
-        with service.wake:
-            if not service.wake.wait_for(lambda: bool(actions), ANSWER_S):
-                raise TimeoutError(f"TimeStep {seq}: no action within {ANSWER_S:g} s")
+        deadline_ns = service.clock.now_ns() + round(ANSWER_S * 1e9)
+        with service.wake:  # as the bridge waits
+            while not actions:
+                if not service.clock.wait_until(deadline_ns, service.wake):
+                    raise TimeoutError(f"TimeStep {seq}: no action within {ANSWER_S:g} s")
         answer = actions.take()[-1].message
         if answer.answered_seq != seq:
             raise RuntimeError(f"expected an answer to TimeStep {seq}, got one to {answer.answered_seq}")

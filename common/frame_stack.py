@@ -75,10 +75,10 @@ class FrameStack(Generic[Frame]):
         Raises:
             MessageError: the numbers of ids and frames differ, or ids do not increase.
         """
-        ids = [int(i) for i in frame_ids]
+        ids = list(map(int, frame_ids))
         if len(ids) != len(frames):
             raise MessageError(f"TimeStep {step.seq}: {len(ids)} frame ids for {len(frames)} frames")
-        if any(b <= a for a, b in pairwise(ids)):
+        if len(ids) > 1 and any(b <= a for a, b in pairwise(ids)):
             raise MessageError(f"TimeStep {step.seq}: frame ids do not increase: {ids}")
         if step.incarnation != self._incarnation:
             self._incarnation = step.incarnation
@@ -110,19 +110,24 @@ class FrameStack(Generic[Frame]):
 
     def _build(self, attempt: int, newest: int, certain: bool) -> Stack[Frame] | None:
         lowest = self._oldest_of.get(attempt, newest)
-        wanted = [newest - back for back in reversed(range(self._stack_size))]
+        wanted = list(range(newest - self._stack_size + 1, newest + 1))
         # Where the attempt's first TimeStep is missing, ids below the lowest one seen may belong to it or not.
         known = certain and (attempt in self._started or wanted[0] >= lowest)
-        wanted = [max(i, lowest) for i in wanted]
-        available = sorted(i for i in self._frames if lowest <= i <= newest)
-        if not available:
+        if wanted[0] < lowest:
+            wanted = [max(i, lowest) for i in wanted]
+        found = wanted if self._frames.keys() >= set(wanted) else self._nearest(wanted, lowest, newest)
+        if not found:
             return None
-        found = [available[max(bisect_right(available, i) - 1, 0)] for i in wanted]
         return Stack(
-            frames=tuple(self._frames[i] for i in found),
+            frames=tuple(map(self._frames.__getitem__, found)),
             frame_ids=tuple(found),
             whole=known and found == wanted,
         )
+
+    def _nearest(self, wanted: list[int], lowest: int, newest: int) -> list[int]:
+        """Return for each wanted id the next older one there is, or else the oldest; nothing if there is none."""
+        available = sorted(i for i in self._frames if lowest <= i <= newest)
+        return [available[max(bisect_right(available, i) - 1, 0)] for i in wanted] if available else []
 
     def _trim(self) -> None:
         for remembered in (self._frames, self._newest_as_of, self._oldest_of, self._started):

@@ -6,7 +6,7 @@ the sender resends that, paced, below everything else. So the newest message is 
 short network outage costs freshness only while it lasts.
 
     sender                                            receiver
-      retain(seq, payload) ; put  ── message ───────▶   accept
+      put ; retain(seq, payload)  ── message ───────▶   accept
       head() every 0.2 s          ── StreamHead ────▶   note_head        what exists, what can still be resent
       acknowledge                 ◀─ Acknowledgement    acknowledgement  what is done, what is missing
       due() ; put on `resent`     ── message ───────▶   accept
@@ -274,10 +274,13 @@ class JournalSender:
         return self._retained.given_up
 
     def put(self, seq: int, payload: bytes) -> None:
-        """Retain and publish message ``seq``."""
-        with self._lock:
-            self._retained.retain(seq, payload, self._clock.now_ns())
-        self._publisher.put(payload)
+        """Publish and retain message ``seq``."""
+        try:
+            self._publisher.put(payload)
+        finally:
+            # While it is on its way: whoever waits for it need not wait for that.
+            with self._lock:
+                self._retained.retain(seq, payload, self._clock.now_ns())
 
     def republish(self, payload: bytes) -> None:
         """Publish once more what :meth:`put` has published."""

@@ -136,9 +136,10 @@ class ZenohTransport:
 
         def receive(sample: Any) -> None:
             payload = sample.payload.to_bytes()
+            callback(payload)
+            # Afterwards, while who was notified wakes up.
             with self._count_lock:
                 self.bytes_received[topic.name] += len(payload)
-            callback(payload)
 
         handler = zenoh.handlers.Callback(receive, indirect=False)
         if topic.delivery is Delivery.CACHED:
@@ -226,9 +227,9 @@ class _CountingPublisher:
         self._name, self._put, self._counter, self._lock = name, put, counter, lock
 
     def put(self, payload: bytes) -> None:
+        self._put(payload)
         with self._lock:
             self._counter[self._name] += len(payload)
-        self._put(payload)
 
 
 @dataclass(frozen=True, eq=False)

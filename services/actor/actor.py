@@ -153,7 +153,7 @@ class Actor:
         self._newest, self._last_answer, self._unanswered = order, b"", None
         if newest.message.is_last or (stack is None and self._spec.has_camera):
             return
-        frames = np.stack(stack.frames) if stack else None
+        frames = np.array(stack.frames) if stack else None
         proprioception = newest.message.proprioception
         if self._pending:
             proprioception = self._pending.observe(newest.message, proprioception)

@@ -409,12 +409,24 @@ def test_extras_may_be_absent():
         (array("f4", 2, raw=np.array([0, np.nan], np.float32).tobytes()), "expected finite numbers"),
         (array("f4", 2, raw=np.array([np.inf, 0], np.float32).tobytes()), "expected finite numbers"),
         (array("f4", 2, raw=np.array([0, -np.inf], np.float32).tobytes()), "expected finite numbers"),
+        (array("f4", 2, raw=np.array([np.inf, -np.inf], np.float32).tobytes()), "expected finite numbers"),
     ],
 )
 def test_a_wrong_array_is_refused_with_what_was_expected(value, expected):
     action = Action(1, 2, 3, np.zeros(2, np.float32), -1.0, 4, 5, 6, 7, 8, 9)
     with pytest.raises(MessageError, match=f"^Action.action: {expected}"):
         decode(changed(action, "action", value), Action, WITH_CAMERA)
+
+
+@pytest.mark.parametrize("size", [1, 2, 63, 64, 65, 1000])
+def test_one_number_that_is_not_finite_is_found_among_few_and_among_many(size):
+    for wrong in (np.nan, np.inf, -np.inf):
+        values = np.full(size, np.finfo(np.float32).max, np.float32)  # their sum is finite
+        action = Action(1, 2, 3, values, -1.0, 4, 5, 6, 7, 8, 9)
+        assert_same(decode(encode(action), Action), action)
+        values[-1] = wrong
+        with pytest.raises(MessageError, match=r"^Action.action: expected finite numbers, got NaN or infinity"):
+            decode(encode(action), Action)
 
 
 def test_equal_letters_mean_equal_sizes_within_a_message():

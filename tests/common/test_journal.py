@@ -13,6 +13,7 @@ import pytest
 from common import topics
 from common.clock import FakeClock
 from common.codec import decode, encode
+from common.errors import TransportError
 from common.journal import HEAD_PERIOD_S, MAX_RANGES, RESEND_AFTER_S, JournalSender, OrderedReceiver, RetainedMessages
 from common.messages import Acknowledgement, StreamHead
 from common.run_settings import JournalSettings
@@ -538,6 +539,28 @@ def started():
     yield start
     for sender in senders:
         sender.stop()
+
+
+def test_a_message_leaves_before_it_is_retained(clock):
+    network, retained_then = InMemoryNetwork(), []
+    sender = make_sender(network, clock)
+    network.transport(make_run()).subscribe(
+        topics.EXPERIENCE, lambda payload: retained_then.append(sender.unacknowledged)
+    )
+    put(sender, 3)
+    assert retained_then == [0, 1, 2]
+    assert sender.unacknowledged == 3
+
+
+def test_a_message_that_cannot_leave_is_retained_all_the_same(clock):
+    def refuse(topic, payload):
+        raise TransportError("the session is closed")
+
+    sender = make_sender(InMemoryNetwork(refuse), clock)
+    for seq in range(2):
+        with pytest.raises(TransportError, match="the session is closed"):
+            sender.put(seq, b"x")
+    assert sender.unacknowledged == 2
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.1, 0.4])
