@@ -198,8 +198,12 @@ def _decoder(hint: Any, bounds: Bounds = _UNBOUNDED) -> Decoder:
     if hint is bool:
         return lambda value, where, sizes: _instance(value, bool, where)
     if hint is str:
-        return lambda value, where, sizes: _text(value, where)
-    return lambda value, where, sizes: _number(hint, value, where, bounds)
+        return lambda value, where, sizes: value if type(value) is str else _text(value, where)
+    low = -_LARGEST if bounds.low is None else bounds.low
+    high = _LARGEST if bounds.high is None else bounds.high
+    return lambda value, where, sizes: (
+        value if type(value) is hint and low <= value <= high else _number(hint, value, where, bounds)
+    )
 
 
 def _instance(value: Any, cls: type, where: str) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 
 from common.messages import Float32Array, TaskSpec
 from common.policies.base import ChosenAction, Observation
-from common.policies.unit_range import UnitRange, action_range
+from common.policies.unit_range import UnitRange, action_range, vector_range
 
 _LOG_2 = log(2.0)
 _LOG_DENSITY_OFFSET = log(sqrt(2.0 * pi)) + 2.0 * _LOG_2
@@ -30,11 +30,7 @@ class NumpyActor:
         low, high = parameters["log_std_bounds"].tolist()
         self._log_std_range = (low + high) / 2.0, (high - low) / 2.0
         self._actions = action_range(spec)
-        self._vector = UnitRange(
-            np.concatenate([spec.proprioception_low, spec.action_low]),
-            np.concatenate([spec.proprioception_high, spec.action_high]),
-            "proprioception and action bounds",
-        )
+        self._vector = vector_range(spec)
 
     def act(
         self,
