@@ -151,11 +151,10 @@ def test_pushed_weights_make_a_policy_that_acts(name, spec, dtype):
     assert np.isfinite(chosen.log_probability)
 
 
-@pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_what_has_diverged_is_not_pushed_any_more(name, spec, number):
+def test_what_has_diverged_is_not_pushed_any_more(name, spec):
     algorithm = make_algorithm(name, spec)
     state = algorithm.state_dict()
-    state["actor.1.weight"][:] = number
+    state["actor.1.weight"][:] = np.nan
     algorithm.load_state_dict(state)
     algorithm.update(minibatches(spec, 1)[0])
     with pytest.raises(MessageError, match=r"after 1 updates .* has diverged"):
