@@ -48,7 +48,6 @@ def comparisons() -> list[Comparison]:
 def our_learner(resources: ExitStack, *, what: str) -> Prepared:
     """The message that the learner pushes."""
     from common.algorithms.sac import SAC
-    from common.codec import encode
     from common.cpu_tuning import tune_process
 
     tune_process(threads=1)
@@ -58,7 +57,7 @@ def our_learner(resources: ExitStack, *, what: str) -> Prepared:
     return _with_actor(
         resources,
         "benchmarks.policy_weights:our_actor",
-        lambda: encode(algorithm.policy_weights(1, config.weights_dtype)),
+        lambda: algorithm.encoded_policy(1, config.weights_dtype),
         what,
     )
 

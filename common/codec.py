@@ -3,8 +3,8 @@
 Not pickle: a pickle executes what a peer sends. A payload is one msgpack map: ``schema`` (version), ``message``
 (type name) and the message's fields; an array is ``[dtype, shape, raw little-endian bytes]``. Decoding checks type,
 shape, dtype, finiteness and bounds, so that what a service receives is safe to use as it is. Decoded arrays are
-read-only views of the received bytes: nothing is copied. Encoded camera frames keep their bytes, to be sent on
-unchanged, beside the pixels.
+read-only views of bytes: of the payload itself for the large array of :data:`BULK_FIELDS`. Encoded camera frames keep
+their bytes, to be sent on unchanged, beside the pixels.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import math
 import reprlib
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import cache
@@ -21,10 +21,21 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 
 import msgpack
 import numpy as np
+import numpy.typing as npt
 
+from common.bulk_payload import pack_bulk, unpack_bulk
 from common.errors import MessageError, SchemaVersionError
 from common.frame_encoding import EncodedFrames, FrameEncoding
-from common.messages import MESSAGES, SCHEMA_VERSION, Array, Bounds, CameraFrames, Dimensions
+from common.messages import (
+    MESSAGES,
+    SCHEMA_VERSION,
+    Array,
+    ArrayMinibatch,
+    Bounds,
+    CameraFrames,
+    Dimensions,
+    PolicyWeights,
+)
 
 Message = TypeVar("Message")
 Sizes = dict[str, Any]
@@ -38,14 +49,34 @@ _FEW = 64
 _shown = reprlib.repr
 """Text of what came, short enough for a log whatever it is."""
 _BY_NAME = {message.__name__: message for message in MESSAGES}
+BULK_FIELDS: dict[type, str] = {PolicyWeights: "buffer", ArrayMinibatch: "frames"}
+"""Of messages with megabytes in one array: its field, which comes last (:mod:`common.bulk_payload`)."""
 
 
 def encode(message: Any) -> bytes:
     """Return the payload of a message of :data:`common.messages.MESSAGES`."""
+    bulk = BULK_FIELDS.get(type(message))
+    if bulk is not None:
+        values = dict(vars(message))
+        array = values.pop(bulk)
+        head = {"schema": SCHEMA_VERSION, "message": type(message).__name__, **values}
+        return pack_bulk(head, bulk, array.dtype.str, array.shape, [np.ascontiguousarray(array)], _plain)
     values = {"schema": SCHEMA_VERSION, "message": type(message).__name__, **vars(message)}
     packed = msgpack.packb(values, default=_plain, use_bin_type=True)
     assert isinstance(packed, bytes)
     return packed
+
+
+def encode_gathered(message: type, values: Mapping[str, Any], pieces: Sequence[npt.NDArray[Any]]) -> bytes:
+    """Return the payload of a message of :data:`BULK_FIELDS` whose large array is bytes that lie in several places.
+
+    Args:
+        message: the message's type.
+        values: its other fields.
+        pieces: contiguous arrays, whose bytes follow each other in the message.
+    """
+    head = {"schema": SCHEMA_VERSION, "message": message.__name__, **values}
+    return pack_bulk(head, BULK_FIELDS[message], "|u1", [sum(piece.nbytes for piece in pieces)], pieces, _plain)
 
 
 def decode(payload: bytes, expected: type[Message], dimensions: Dimensions | None = None) -> Message:
@@ -63,7 +94,9 @@ def decode(payload: bytes, expected: type[Message], dimensions: Dimensions | Non
     """
     name = expected.__name__
     try:
-        values = msgpack.unpackb(payload, raw=False, strict_map_key=True)
+        values = unpack_bulk(payload) if expected in BULK_FIELDS else None
+        if values is None:
+            values = msgpack.unpackb(payload, raw=False, strict_map_key=True)
     except (ValueError, msgpack.UnpackException, RecursionError) as error:
         raise MessageError(f"{name}: {len(payload)} bytes are not one msgpack value: {error}") from error
     if not isinstance(values, dict):
@@ -170,8 +203,12 @@ def _decoder(hint: Any, bounds: Bounds = _UNBOUNDED) -> Decoder:
     if hint is bool:
         return lambda value, where, sizes: _instance(value, bool, where)
     if hint is str:
-        return lambda value, where, sizes: _text(value, where)
-    return lambda value, where, sizes: _number(hint, value, where, bounds)
+        return lambda value, where, sizes: value if type(value) is str else _text(value, where)
+    low = -_LARGEST if bounds.low is None else bounds.low
+    high = _LARGEST if bounds.high is None else bounds.high
+    return lambda value, where, sizes: (
+        value if type(value) is hint and low <= value <= high else _number(hint, value, where, bounds)
+    )
 
 
 def _instance(value: Any, cls: type, where: str) -> Any:
@@ -225,7 +262,7 @@ def _array_decoder(dtype: np.dtype[Any], shape: tuple[str | int, ...]) -> Decode
         if sent_dtype != code:
             raise MessageError(f"{where}: expected dtype {code}, got {_shown(sent_dtype)}")
         _check_shape(sent_shape, shape, where, sizes)
-        if not isinstance(raw, bytes) or len(raw) != math.prod(sent_shape) * item_size:
+        if not isinstance(raw, (bytes, memoryview)) or len(raw) != math.prod(sent_shape) * item_size:
             raise MessageError(f"{where}: {sent_shape} of {dtype} do not fit the bytes that came")
         try:
             result: np.ndarray[Any, Any] = np.ndarray(sent_shape, dtype, raw)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -14,14 +15,14 @@ from common.algorithms.adam import Adam
 from common.algorithms.base import Algorithm, Arrays
 from common.algorithms.config import AlgorithmConfig
 from common.algorithms.upload import upload
-from common.errors import ConfigError
-from common.messages import Float32Array, PolicyWeights, TaskSpec
+from common.errors import ConfigError, MessageError
+from common.messages import Float32Array, TaskSpec
 from common.minibatch import DeviceArray
 from common.networks.encoder import Encoder
 from common.networks.mlp import Actor
 from common.networks.sizes import FEATURES, cropped_shape
 from common.policies.unit_range import action_range, proprioception_range
-from common.policies.weights import initial_parameters, pack_weights
+from common.policies.weights import encode_weights, initial_parameters
 
 
 class ActorCritic(Algorithm):
@@ -77,6 +78,7 @@ class ActorCritic(Algorithm):
             self.vector_size += FEATURES
             self.encoder = Encoder(*cropped_shape(spec), config.encoder_strides, dtype=dtype, wide=wide)
         self.actor = Actor(self.vector_size, config.hidden_size, sizes.A, dtype=dtype, wide=wide)
+        self._policy_parameters = self._named("encoder", "actor")
         initial = initial_parameters(
             spec,
             config.hidden_size,
@@ -85,18 +87,25 @@ class ActorCritic(Algorithm):
             zero_initialised_head=config.zero_initialised_head,
         )
         with torch.no_grad():
-            for name, parameter in self._policy_parameters().items():
+            for name, parameter in self._policy_parameters.items():
                 parameter.copy_(torch.from_numpy(initial[name]))
 
     def metrics(self) -> dict[str, float]:
         """See :class:`Algorithm`."""
         return {name: float(value) for name, value in self._metrics.items()}
 
-    def policy_weights(self, version: int, dtype: str) -> PolicyWeights:
+    def encoded_policy(self, version: int, dtype: str) -> bytes:
         """See :class:`Algorithm`."""
-        parameters = {name: _array(value) for name, value in self._policy_parameters().items()}
+        # A parameter that is not finite shows in the losses of the next update; that is a handful of numbers to look
+        # at, not a million. One that has become so in the very last update is left to the receivers.
+        for name, value in self.metrics().items():
+            if not math.isfinite(value):
+                raise MessageError(
+                    f"after {self.updates} updates {name} is {value}: learning has diverged, nothing is pushed any more"
+                )
+        parameters = {name: _array(value) for name, value in self._policy_parameters.items()}
         bounds = [self._config.log_std_low, self._config.log_std_high]
-        return pack_weights(
+        return encode_weights(
             parameters | {"log_std_bounds": np.array(bounds)},
             version=version,
             updates=self.updates,
@@ -143,9 +152,6 @@ class ActorCritic(Algorithm):
             if getattr(self, prefix) is not None
             for name, parameter in getattr(self, prefix).named_parameters()
         }
-
-    def _policy_parameters(self) -> dict[str, nn.Parameter]:
-        return self._named("encoder", "actor")
 
     def _random_noise(self, rows: int, columns: int) -> Tensor:
         return torch.randn(rows, columns, generator=self._generator, dtype=self._dtype, device=self._device)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import torch
 
 from common.algorithms.config import AlgorithmConfig
+from common.codec import decode
 from common.messages import PolicyWeights, TaskSpec
 from common.minibatch import Minibatch
 from common.networks.precision import Precision
@@ -26,7 +27,7 @@ class Algorithm(ABC):
     while True:
         algorithm.update(next_minibatch())
         if algorithm.updates % config.policy_push_interval == 0:
-            push(algorithm.policy_weights(version, config.weights_dtype))
+            push(algorithm.encoded_policy(version, config.weights_dtype))
     """
 
     updates: int
@@ -66,8 +67,16 @@ class Algorithm(ABC):
         """Return losses and the like of the latest update; empty before the first. Waits for the device."""
 
     @abstractmethod
+    def encoded_policy(self, version: int, dtype: str) -> bytes:
+        """Return the payload of the policy's PolicyWeights, as number ``version``, in ``float32`` or ``float16``.
+
+        Raises:
+            MessageError: what was learnt is not finite; the text says since when.
+        """
+
     def policy_weights(self, version: int, dtype: str) -> PolicyWeights:
-        """Return the policy alone, as number ``version``, in ``float32`` or ``float16``."""
+        """Return what a receiver of :meth:`encoded_policy` decodes."""
+        return decode(self.encoded_policy(version, dtype), PolicyWeights)
 
     @abstractmethod
     def state_dict(self) -> Arrays:

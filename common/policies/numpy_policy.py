@@ -9,7 +9,7 @@ import numpy as np
 
 from common.messages import Float32Array, TaskSpec
 from common.policies.base import ChosenAction, Observation
-from common.policies.unit_range import UnitRange, action_range
+from common.policies.unit_range import UnitRange, action_range, vector_range
 
 _LOG_2 = log(2.0)
 _LOG_DENSITY_OFFSET = log(sqrt(2.0 * pi)) + 2.0 * _LOG_2
@@ -22,17 +22,15 @@ class NumpyActor:
     def __init__(self, spec: TaskSpec, parameters: Mapping[str, Float32Array]) -> None:
         """Take over ``parameters``, named and shaped as in :mod:`common.policies.weights`."""
         layers = [(parameters[f"actor.{i}.weight"], parameters[f"actor.{i}.bias"]) for i in range(3)]
-        # The first has few columns: the other way round its product takes half the time.
-        self._first = (np.asfortranarray(layers[0][0]), layers[0][1])
-        self._hidden, self._head = layers[1:]
+        self._first, self._hidden, self._head = layers
+        if not spec.has_camera:
+            # Few columns: the other way round the product takes half the time. With the encoder's features there are
+            # so many that it saves less than turning them round takes.
+            self._first = (np.asfortranarray(layers[0][0]), layers[0][1])
         low, high = parameters["log_std_bounds"].tolist()
         self._log_std_range = (low + high) / 2.0, (high - low) / 2.0
         self._actions = action_range(spec)
-        self._vector = UnitRange(
-            np.concatenate([spec.proprioception_low, spec.action_low]),
-            np.concatenate([spec.proprioception_high, spec.action_high]),
-            "proprioception and action bounds",
-        )
+        self._vector = vector_range(spec)
 
     def act(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -37,9 +38,28 @@ class UnitRange:
 
 def action_range(spec: TaskSpec) -> UnitRange:
     """Return the map of the task's actions."""
-    return UnitRange(spec.action_low, spec.action_high, "action bounds")
+    return _range(_bytes(spec.action_low), _bytes(spec.action_high), "action bounds")
 
 
 def proprioception_range(spec: TaskSpec) -> UnitRange:
     """Return the map of the task's proprioception."""
-    return UnitRange(spec.proprioception_low, spec.proprioception_high, "proprioception bounds")
+    return _range(_bytes(spec.proprioception_low), _bytes(spec.proprioception_high), "proprioception bounds")
+
+
+def vector_range(spec: TaskSpec) -> UnitRange:
+    """Return the map of the task's proprioception and, behind it, its actions."""
+    return _range(
+        _bytes(spec.proprioception_low) + _bytes(spec.action_low),
+        _bytes(spec.proprioception_high) + _bytes(spec.action_high),
+        "proprioception and action bounds",
+    )
+
+
+@cache
+def _range(low: bytes, high: bytes, name: str) -> UnitRange:
+    """Return the map between float32 bounds: made once, not for each policy of a task."""
+    return UnitRange(np.frombuffer(low, np.float32), np.frombuffer(high, np.float32), name)
+
+
+def _bytes(values: Float32Array) -> bytes:
+    return np.asarray(values, np.float32).tobytes()

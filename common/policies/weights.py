@@ -25,6 +25,8 @@ import numpy as np
 import numpy.typing as npt
 import xxhash
 
+from common.bulk_payload import as_aligned
+from common.codec import decode, encode_gathered
 from common.errors import MessageError
 from common.messages import Float32Array, PolicyWeights, TaskSpec
 from common.networks.sizes import CHANNELS, FEATURES, KERNEL
@@ -90,6 +92,52 @@ def initial_parameters(
     return parameters
 
 
+def encode_weights(
+    parameters: Mapping[str, npt.NDArray[Any]],
+    *,
+    version: int,
+    updates: int,
+    algorithm: str,
+    hidden_size: int,
+    encoder_strides: Sequence[int],
+    dtype: str,
+) -> bytes:
+    """Return the payload of the PolicyWeights that carry ``parameters``, which are copied into it and nowhere else.
+
+    Args:
+        parameters: name -> array; the order is kept.
+        version, updates, algorithm, hidden_size, encoder_strides: see :class:`PolicyWeights`.
+        dtype: ``float32`` or ``float16``.
+
+    Raises:
+        MessageError: a parameter is not finite in ``dtype``. Only numbers that are converted are looked at: whoever
+            learns looks at its losses, and whoever acts at every number.
+    """
+    wire = _wire_dtype(dtype)
+    pieces, digest = [], xxhash.xxh3_128()
+    for name, values in parameters.items():
+        piece = np.ascontiguousarray(values)
+        if values.dtype != wire:
+            with np.errstate(over="ignore"):
+                piece = piece.astype(wire)
+            if not np.isfinite(piece).all():
+                raise MessageError(f"policy weights after {updates} updates: {name} has no finite numbers in {dtype}")
+        pieces.append(piece)
+        digest.update(piece.data)
+    fields = {
+        "version": version,
+        "updates": updates,
+        "algorithm": algorithm,
+        "hidden_size": hidden_size,
+        "encoder_strides": np.array(encoder_strides, np.int64),
+        "names": list(parameters),
+        "shapes": [list(values.shape) for values in parameters.values()],
+        "dtype": dtype,
+        "digest": digest.hexdigest(),
+    }
+    return encode_gathered(PolicyWeights, fields, pieces)
+
+
 def pack_weights(
     parameters: Mapping[str, npt.NDArray[Any]],
     *,
@@ -100,34 +148,17 @@ def pack_weights(
     encoder_strides: Sequence[int],
     dtype: str,
 ) -> PolicyWeights:
-    """Return the message that carries ``parameters``.
-
-    Args:
-        parameters: name -> array; the order is kept.
-        version, updates, algorithm, hidden_size, encoder_strides: see :class:`PolicyWeights`.
-        dtype: ``float32`` or ``float16``.
-
-    Raises:
-        MessageError: a parameter is not finite, or too large for ``dtype``.
-    """
-    wire = _wire_dtype(dtype)
-    flat = np.concatenate([np.ravel(values) for values in parameters.values()], dtype=np.float32)
-    with np.errstate(over="ignore"):
-        values = flat.astype(wire, copy=False)
-    if not _all_finite(values):
-        raise MessageError(f"policy weights after {updates} updates are not finite numbers in {dtype}")
-    return PolicyWeights(
+    """Return the message that carries ``parameters``, as its receiver decodes it; see :func:`encode_weights`."""
+    payload = encode_weights(
+        parameters,
         version=version,
         updates=updates,
         algorithm=algorithm,
         hidden_size=hidden_size,
-        encoder_strides=np.array(encoder_strides, np.int64),
-        names=list(parameters),
-        shapes=[list(values.shape) for values in parameters.values()],
+        encoder_strides=encoder_strides,
         dtype=dtype,
-        buffer=values.view(np.uint8),
-        digest=_digest(values.view(np.uint8)),
     )
+    return decode(payload, PolicyWeights)
 
 
 def unpack_weights(weights: PolicyWeights, expected: Mapping[str, list[int]]) -> dict[str, Float32Array]:
@@ -154,7 +185,7 @@ def unpack_weights(weights: PolicyWeights, expected: Mapping[str, list[int]]) ->
         raise MessageError(
             f"policy weights {weights.version}: expected {size * wire.itemsize} bytes, got {weights.buffer.nbytes}"
         )
-    flat = weights.buffer.view(wire).astype(np.float32, copy=False)
+    flat = as_aligned(weights.buffer.view(wire)).astype(np.float32, copy=False)
     if not _all_finite(flat):
         raise MessageError(f"policy weights {weights.version}: expected finite numbers, got NaN or infinity")
     parameters: dict[str, Float32Array] = {}

@@ -11,9 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from common.algorithms.base import Algorithm, Arrays
-from common.codec import encode
-from common.errors import ConfigError
-from common.messages import PolicyWeights
+from common.errors import ConfigError, ServiceError
 from common.record import write_atomically
 
 logger = logging.getLogger(__name__)
@@ -30,15 +28,24 @@ class CheckpointWriter:
         self.failure: str | None = None
         """Why the newest checkpoint could not be written, if it could not."""
         self._wake = threading.Condition()
-        self._pending: tuple[PolicyWeights, Arrays] | None = None
+        self._pending: tuple[int, bytes, Arrays] | None = None
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="checkpoint", daemon=True)
         self._thread.start()
 
-    def write(self, weights: PolicyWeights, state: Arrays) -> None:
-        """Take over a checkpoint to write."""
+    def write(self, version: int, policy: bytes, state: Arrays) -> None:
+        """Take over a checkpoint to write: policy version, encoded policy, and what the next update depends on.
+
+        Raises:
+            ServiceError: the state is not finite; the checkpoint before it stays, to go on from.
+        """
+        for name, values in state.items():
+            if values.dtype.kind == "f" and not np.isfinite(values).all():
+                raise ServiceError(
+                    f"{name} is not finite: learning has diverged; {self._directory} keeps the checkpoint before"
+                )
         with self._wake:
-            self._pending = (weights, state)
+            self._pending = (version, policy, state)
             self._wake.notify()
 
     def close(self) -> None:
@@ -56,11 +63,11 @@ class CheckpointWriter:
                 pending, self._pending = self._pending, None
             if pending is None:
                 return
-            weights, state = pending
+            version, policy, state = pending
             try:
-                write_atomically(self._directory / POLICY_FILE, encode(weights))
+                write_atomically(self._directory / POLICY_FILE, policy)
                 buffer = io.BytesIO()
-                np.savez(buffer, **{_VERSION_KEY: np.int64(weights.version)}, **state)  # type: ignore[arg-type]
+                np.savez(buffer, **{_VERSION_KEY: np.int64(version)}, **state)  # type: ignore[arg-type]
                 write_atomically(self._directory / CHECKPOINT_FILE, buffer.getvalue())
                 self.failure = None
             except OSError as error:

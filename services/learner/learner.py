@@ -9,7 +9,6 @@ from pathlib import Path
 from common import topics
 from common.algorithms.base import Algorithm
 from common.algorithms.config import AlgorithmConfig
-from common.messages import PolicyWeights
 from common.minibatch import Minibatch
 from common.service import Service
 from services.learner.checkpoint import CheckpointWriter
@@ -111,13 +110,14 @@ class Learner:
         # A learner without its predecessor's last version must not fall behind what the actor already has.
         known = int(self._service.peer_counter(topics.ACTOR, "policy_version"))
         self._policy_version = max(self._policy_version, known) + 1
-        self._pusher.push(self._weights())
+        self._pusher.push(self._policy_version, self._encoded_policy(self._policy_version))
 
-    def _weights(self) -> PolicyWeights:
-        return self._algorithm.policy_weights(max(1, self._policy_version), self._config.weights_dtype)
+    def _encoded_policy(self, version: int) -> bytes:
+        return self._algorithm.encoded_policy(version, self._config.weights_dtype)
 
     def _save(self) -> None:
-        self._checkpoints.write(self._weights(), self._algorithm.state_dict())
+        version = max(1, self._policy_version)
+        self._checkpoints.write(version, self._encoded_policy(version), self._algorithm.state_dict())
 
     def _ask_checkpoint(self) -> str:
         self._checkpoint_asked.set()

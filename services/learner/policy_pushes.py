@@ -10,10 +10,9 @@ acknowledgement is what the network took for the policy's bytes::
 from __future__ import annotations
 
 from common import topics
-from common.codec import encode
 from common.errors import TransportError
 from common.inbox import Inbox
-from common.messages import PolicyAcknowledgement, PolicyWeights
+from common.messages import PolicyAcknowledgement
 from common.service import Service
 
 ACKNOWLEDGED_WITHIN_S = 10.0
@@ -64,7 +63,7 @@ class PolicyPusher:
             service.transport, topics.POLICY_ACK, PolicyAcknowledgement, self._wake, self._clock, service.refusals
         )
         self._pacing = PushPacing(share)
-        self._pending: PolicyWeights | None = None
+        self._pending: tuple[int, bytes] | None = None
         self._stopping = False
         self.pushes = 0
         self.skipped = 0
@@ -77,11 +76,11 @@ class PolicyPusher:
         """What the network gave to the last push that was acknowledged; 0 before the first."""
         return self._pacing.bytes_per_s
 
-    def push(self, weights: PolicyWeights) -> None:
-        """Send ``weights`` as soon as the one before is gone and pushes have not had more than their share."""
+    def push(self, version: int, payload: bytes) -> None:
+        """Send an encoded policy as soon as the one before is gone and pushes have not had more than their share."""
         with self._wake:
             self.skipped += self._pending is not None
-            self._pending = weights
+            self._pending = version, payload
             self._wake.notify()
 
     def close(self) -> None:
@@ -92,17 +91,17 @@ class PolicyPusher:
         self._thread.join(0.2)
 
     def _run(self) -> None:
-        while (weights := self._next()) is not None:
-            payload = encode(weights)
+        while (pending := self._next()) is not None:
+            version, payload = pending
             self._pacing.begin(self._clock.now_ns())
             try:
                 self._publisher.put(payload)
             except TransportError:
                 return  # The session was closed around a push that was stuck in a dead link.
             self.pushes += 1
-            self._wait_for_arrival(weights.version, len(payload))
+            self._wait_for_arrival(version, len(payload))
 
-    def _next(self) -> PolicyWeights | None:
+    def _next(self) -> tuple[int, bytes] | None:
         """Wait until a push may begin, and return what is newest then; None if there is to be none."""
         with self._wake:
             while not self._stopping:
@@ -110,8 +109,8 @@ class PolicyPusher:
                 if self._pending is not None and silence_s <= 0:
                     break
                 self._clock.wait(self._wake, None if self._pending is None else silence_s)
-            weights, self._pending = self._pending, None
-            return None if self._stopping else weights
+            pending, self._pending = self._pending, None
+            return None if self._stopping else pending
 
     def _wait_for_arrival(self, version: int, size: int) -> None:
         """Wait for the acknowledgement of a policy that has been put; not if nobody is there who would send one."""

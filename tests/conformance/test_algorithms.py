@@ -12,7 +12,7 @@ import pytest
 from common.algorithms import ALGORITHMS, load_algorithm
 from common.algorithms.base import Algorithm
 from common.algorithms.presets import presets_of
-from common.errors import ConfigError
+from common.errors import ConfigError, MessageError
 from common.policies import policy_from_weights
 from tests.reference.tasks import make_minibatch, make_observation, make_spec
 
@@ -149,6 +149,16 @@ def test_pushed_weights_make_a_policy_that_acts(name, spec, dtype):
     assert chosen.action.shape == spec.action_low.shape
     assert np.isfinite(chosen.action).all()
     assert np.isfinite(chosen.log_probability)
+
+
+def test_what_has_diverged_is_not_pushed_any_more(name, spec):
+    algorithm = make_algorithm(name, spec)
+    state = algorithm.state_dict()
+    state["actor.1.weight"][:] = np.nan
+    algorithm.load_state_dict(state)
+    algorithm.update(minibatches(spec, 1)[0])
+    with pytest.raises(MessageError, match=r"after 1 updates .* has diverged"):
+        algorithm.encoded_policy(1, "float32")
 
 
 def test_pushed_weights_do_not_change_with_later_updates(name, spec):

@@ -102,16 +102,56 @@ def test_a_buffer_of_the_wrong_length_is_refused():
         unpack_weights(with_buffer(weights, values), SHAPES)
 
 
-def test_numbers_that_are_not_finite_are_refused_on_both_sides():
-    parameters = make_parameters()
-    parameters["actor.1.bias"][0] = np.nan
-    with pytest.raises(MessageError, match="not finite"):
-        make_weights(parameters)
+@pytest.mark.parametrize("bits", [0x7F800000, 0xFF800000, 0x7FC00000, 0xFFC00001], ids=["inf", "-inf", "nan", "-nan"])
+@pytest.mark.parametrize("at", [0, 7, -1])
+def test_a_number_that_is_not_finite_is_refused_although_its_digest_fits(bits, at):
     weights = make_weights()
     values = np.frombuffer(weights.buffer.tobytes(), np.uint32).copy()
-    values[7] = 0x7F800000  # infinity
+    values[at] = bits
     with pytest.raises(MessageError, match="finite"):
         unpack_weights(with_buffer(weights, values), SHAPES)
+
+
+def test_finite_numbers_whose_squares_are_not_are_accepted():
+    parameters = make_parameters()
+    parameters["actor.1.bias"][0] = 3e38
+    assert unpack_weights(make_weights(parameters), SHAPES)["actor.1.bias"][0] == np.float32(3e38)
+
+
+def test_the_message_is_a_copy_of_the_parameters():
+    parameters = make_parameters()
+    weights = make_weights(parameters)
+    before = weights.buffer.copy()
+    for values in parameters.values():
+        values += 1.0  # as a learner goes on
+    np.testing.assert_array_equal(weights.buffer, before)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float16"])
+def test_the_values_begin_at_a_multiple_of_four_bytes_however_long_the_other_fields_are(dtype):
+    for length in range(8):
+        weights = pack_weights(
+            make_parameters(),
+            version=3,
+            updates=150,
+            algorithm="x" * length,
+            hidden_size=16,
+            encoder_strides=STRIDES,
+            dtype=dtype,
+        )
+        assert weights.buffer.ctypes.data % 4 == 0
+        assert not weights.buffer.flags.owndata
+        unpack_weights(weights, SHAPES)
+
+
+def test_weights_are_read_wherever_their_bytes_begin():
+    weights = make_weights()
+    for offset in range(1, 4):
+        shifted = np.zeros(weights.buffer.size + offset, np.uint8)[offset:]
+        shifted[:] = weights.buffer
+        for name, values in unpack_weights(replace(weights, buffer=shifted), SHAPES).items():
+            assert values.flags.aligned
+            np.testing.assert_array_equal(values, make_parameters()[name])
 
 
 def test_a_value_too_large_for_float16_is_refused_by_the_sender():

@@ -8,7 +8,7 @@ import pytest
 
 from common.algorithms.sac import SAC
 from common.algorithms.sac_config import SACConfig
-from common.errors import ConfigError
+from common.errors import ConfigError, ServiceError
 from services.learner import checkpoint as checkpoints
 from services.learner.checkpoint import CHECKPOINT_FILE, POLICY_FILE, CheckpointWriter, restore
 from tests.helpers import TIMEOUT_S, eventually, make_spec
@@ -25,7 +25,7 @@ def checkpoint(tmp_path):
     """The file of a good checkpoint, policy version 6."""
     algorithm = make_algorithm()
     writer = CheckpointWriter(tmp_path)
-    writer.write(algorithm.policy_weights(6, "float32"), algorithm.state_dict())
+    writer.write(6, algorithm.encoded_policy(6, "float32"), algorithm.state_dict())
     writer.close()
     assert restore(tmp_path, make_algorithm()) == 6
     return tmp_path / CHECKPOINT_FILE
@@ -93,7 +93,7 @@ def test_the_last_of_several_checkpoints_is_what_remains(tmp_path):
     algorithm = make_algorithm()
     writer = CheckpointWriter(tmp_path)
     for version in range(1, 6):
-        writer.write(algorithm.policy_weights(version, "float32"), algorithm.state_dict())
+        writer.write(version, algorithm.encoded_policy(version, "float32"), algorithm.state_dict())
     writer.close()
     assert restore(tmp_path, make_algorithm()) == 5
 
@@ -110,10 +110,10 @@ def test_while_one_is_written_the_next_ones_replace_each_other(tmp_path, monkeyp
 
     monkeypatch.setattr(checkpoints, "write_atomically", slow_replace)
     writer = CheckpointWriter(tmp_path)
-    writer.write(algorithm.policy_weights(1, "float32"), algorithm.state_dict())
+    writer.write(1, algorithm.encoded_policy(1, "float32"), algorithm.state_dict())
     assert begun.wait(TIMEOUT_S)
     for version in (2, 3, 4):
-        writer.write(algorithm.policy_weights(version, "float32"), algorithm.state_dict())
+        writer.write(version, algorithm.encoded_policy(version, "float32"), algorithm.state_dict())
     go_on.set()
     writer.close()
     assert written == [POLICY_FILE, CHECKPOINT_FILE] * 2
@@ -125,7 +125,7 @@ def test_a_disk_that_cannot_be_written_is_logged_and_does_not_end_the_learner(tm
     no_folder = tmp_path / "file"
     no_folder.touch()
     writer = CheckpointWriter(no_folder)
-    writer.write(algorithm.policy_weights(1, "float32"), algorithm.state_dict())
+    writer.write(1, algorithm.encoded_policy(1, "float32"), algorithm.state_dict())
     writer.close()
     assert "the checkpoint cannot be written" in caplog.text
     assert writer.failure is not None
@@ -136,10 +136,21 @@ def test_a_disk_that_takes_again_has_the_checkpoint(tmp_path):
     algorithm, folder = make_algorithm(), tmp_path / "run"
     folder.touch()
     writer = CheckpointWriter(folder)
-    writer.write(algorithm.policy_weights(1, "float32"), algorithm.state_dict())
+    writer.write(1, algorithm.encoded_policy(1, "float32"), algorithm.state_dict())
     eventually(lambda: writer.failure, "the failure")
     folder.unlink()
-    writer.write(algorithm.policy_weights(2, "float32"), algorithm.state_dict())
+    writer.write(2, algorithm.encoded_policy(2, "float32"), algorithm.state_dict())
     writer.close()
     assert writer.failure is None
     assert restore(folder, make_algorithm()) == 2
+
+
+def test_what_has_diverged_does_not_replace_a_good_checkpoint(checkpoint):
+    algorithm, good = make_algorithm(), checkpoint.read_bytes()
+    state = algorithm.state_dict()
+    state["actor.1.weight"][3, 4] = np.inf
+    writer = CheckpointWriter(checkpoint.parent)
+    with pytest.raises(ServiceError, match=r"actor\.1\.weight is not finite"):
+        writer.write(7, algorithm.encoded_policy(7, "float32"), state)
+    writer.close()
+    assert checkpoint.read_bytes() == good

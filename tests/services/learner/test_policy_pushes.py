@@ -16,10 +16,12 @@ from tests.helpers import TIMEOUT_S, eventually
 from tests.services.builders import Peer, SoloService
 
 
-def make_weights(version, size=100):
-    """A policy of ``size`` bytes, which nobody is going to act with."""
+def make_push(version, size=100):
+    """What is pushed: a version, and its policy of ``size`` bytes, which nobody is going to act with."""
     none = np.zeros(0, np.int64)
-    return PolicyWeights(version, version, "sac", 8, none, [], [], "float32", np.zeros(size, np.uint8), "")
+    return version, encode(
+        PolicyWeights(version, version, "sac", 8, none, [], [], "float32", np.zeros(size, np.uint8), "")
+    )
 
 
 # ---------------------------------------------------------------------- one at a time
@@ -36,7 +38,7 @@ class SlowLink:
         self.pusher = PolicyPusher(self.service)
 
     def push(self, version) -> None:
-        self.pusher.push(make_weights(version))
+        self.pusher.push(*make_push(version))
 
     def wait_for_one_on_its_way(self) -> None:
         assert self.entered.acquire(timeout=TIMEOUT_S)
@@ -153,7 +155,7 @@ class Simulation:
         before = len(self.link.puts)
         for _ in range(round(seconds / self.PERIOD_S)):
             self._version += 1
-            self.pusher.push(make_weights(self._version, self._size))
+            self.pusher.push(*make_push(self._version, self._size))
             self.clock.wait(self._never, self.PERIOD_S)
         return self.link.puts[before:]
 
@@ -246,18 +248,18 @@ def test_a_late_acknowledgement_is_not_taken_for_the_next_push(tmp_path):
     actor = Peer(network)
     policies = actor.messages(topics.POLICY)
     pusher = PolicyPusher(service, share=1.0)
-    pusher.push(make_weights(1))
+    pusher.push(*make_push(1))
     policies.wait_for(1)
     clock.advance(ACKNOWLEDGED_WITHIN_S)
-    pusher.push(make_weights(2))
+    pusher.push(*make_push(2))
     policies.wait_for(2)
     actor.send(topics.POLICY_ACK, PolicyAcknowledgement(1))
-    pusher.push(make_weights(3))
+    pusher.push(*make_push(3))
     assert pusher.bytes_per_s == 0.0
     clock.advance(2.0)
     actor.send(topics.POLICY_ACK, PolicyAcknowledgement(2))
     policies.wait_for(3)
-    assert pusher.bytes_per_s == pytest.approx(len(encode(make_weights(2))) / 2.0)
+    assert pusher.bytes_per_s == pytest.approx(len(make_push(2)[1]) / 2.0)
     pusher.close()
 
 
