@@ -110,6 +110,8 @@ class FrameStack(Generic[Frame]):
 
     def _build(self, attempt: int, newest: int, certain: bool) -> Stack[Frame] | None:
         lowest = self._oldest_of.get(attempt, newest)
+        if newest < lowest:
+            return None  # All frames known of the attempt came after this TimeStep.
         wanted = list(range(newest - self._stack_size + 1, newest + 1))
         # Where the attempt's first TimeStep is missing, ids below the lowest one seen may belong to it or not.
         known = certain and (attempt in self._started or wanted[0] >= lowest)

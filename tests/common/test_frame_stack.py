@@ -116,6 +116,13 @@ def test_a_late_time_step_gets_its_own_stack_and_heals_the_later_ones(stack):
     assert add(stack, Step(4, 4), 4) == whole(2, 3, 4)
 
 
+def test_a_late_time_step_never_shows_frames_that_came_after_it(stack):
+    add(stack, Step(0, 0), 0)
+    add(stack, Step(4, 1, attempt=1), 3)
+    # Of attempt 1 only a frame is known that had not been taken then.
+    assert add(stack, Step(3, 0, attempt=1)) is None
+
+
 def test_a_late_start_tells_where_the_attempt_begins(stack):
     assert add(stack, Step(1, 1), 6) == guess(6, 6, 6)
     assert add(stack, Step(0, 0), 5) == whole(5, 5, 5)
