@@ -58,6 +58,7 @@ class RetainedMessages:
     def __init__(self, max_age_ns: int, max_bytes: int) -> None:
         self._messages: OrderedDict[int, _Retained] = OrderedDict()
         self._max_age_ns, self._max_bytes = max_age_ns, max_bytes
+        self._acknowledged_seq = 0
         self.next_seq = 0
         """Number the next message will get."""
         self.retained_bytes = 0
@@ -73,18 +74,22 @@ class RetainedMessages:
         return next(iter(self._messages), self.next_seq)
 
     def retain(self, seq: int, payload: bytes, now_ns: int) -> None:
-        """Keep message ``seq``, which is being sent now."""
+        """Keep message ``seq``, which is being sent now, unless it has been acknowledged already."""
         if seq != self.next_seq:
             raise ValueError(f"seq: expected {self.next_seq}, got {seq}")
-        self._messages[seq] = _Retained(payload, now_ns, now_ns)
         self.next_seq += 1
+        if seq < self._acknowledged_seq:
+            return
+        self._messages[seq] = _Retained(payload, now_ns, now_ns)
         self.retained_bytes += len(payload)
         while len(self._messages) > 1 and self._over_limit(now_ns):
             self._drop_oldest()
             self.given_up += 1
 
     def acknowledge(self, next_seq: int) -> None:
-        """Forget all messages before ``next_seq``."""
+        """Forget all messages before ``next_seq``; the last of them may be one that is not retained yet."""
+        # No later one can have arrived, whatever the receiver says.
+        self._acknowledged_seq = max(self._acknowledged_seq, min(next_seq, self.next_seq + 1))
         while self._messages and self.oldest_seq < next_seq:
             self._drop_oldest()
 

@@ -79,6 +79,21 @@ def test_an_acknowledgement_of_more_than_was_sent_frees_all():
     assert (len(messages), messages.oldest_seq, messages.next_seq) == (0, 5, 5)
 
 
+def test_a_message_that_is_acknowledged_before_it_is_retained_is_not_held():
+    messages = retained(3)
+    messages.acknowledge(4)  # number 3 is on its way
+    messages.retain(3, b"d", 0)
+    assert (messages.oldest_seq, messages.next_seq, len(messages), messages.retained_bytes) == (4, 4, 0, 0)
+
+
+def test_what_is_sent_after_an_acknowledgement_of_more_than_there_can_be_is_held():
+    messages = retained(3)
+    messages.acknowledge(100)
+    for seq in (3, 4, 5):
+        messages.retain(seq, b"x", 0)
+    assert (messages.oldest_seq, messages.next_seq, len(messages)) == (4, 6, 2)
+
+
 def test_messages_older_than_the_limit_are_given_up():
     messages = retained(5, max_age_s=3.0)  # at 4 s, message 0 is 4 s old and message 1 just 3 s
     assert (messages.oldest_seq, messages.given_up) == (1, 1)
@@ -550,6 +565,21 @@ def test_a_message_leaves_before_it_is_retained(clock):
     put(sender, 3)
     assert retained_then == [0, 1, 2]
     assert sender.unacknowledged == 3
+
+
+def test_a_receiver_that_acknowledges_before_the_put_returns_leaves_nothing_unacknowledged(clock, started):
+    network, taken = InMemoryNetwork(), threading.Event()
+    sender = started(make_sender(network, clock, on_acknowledgement=lambda acknowledgement: taken.set()))
+    receiver = network.transport(make_run())
+
+    def acknowledge(payload):
+        nothing = np.zeros((0, 2), np.int64)
+        receiver.publisher(topics.EXPERIENCE_ACK).put(encode(Acknowledgement(1, 1, nothing, 0.0)))
+        assert taken.wait(TIMEOUT_S)
+
+    receiver.subscribe(topics.EXPERIENCE, acknowledge)
+    put(sender, 1)
+    assert sender.unacknowledged == 0
 
 
 def test_a_message_that_cannot_leave_is_retained_all_the_same(clock):
