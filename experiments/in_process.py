@@ -37,6 +37,8 @@ class InProcessRun:
     def __init__(self, configurations: Mapping[str, Any], clock: SimulatedClock, network: ServiceNetwork) -> None:
         self._configurations, self._clock, self._network = configurations, clock, network
         self._failures: dict[str, Exception] = {}
+        self.told_to_stop: str | None = None
+        """Why the run was to end early; None if it was not."""
         self._services = {name: self._service(name, number) for number, name in enumerate(SERVICES, 1)}
 
     def run(self, look: Callable[[InProcessRun], None]) -> None:
@@ -65,6 +67,7 @@ class InProcessRun:
 
     def stop(self, reason: str) -> None:
         """Let the run end early."""
+        self.told_to_stop = self.told_to_stop or reason
         for service in self._services.values():
             if service.name == ROBOT_BRIDGE or self._failures:
                 service.stop(reason)

@@ -65,7 +65,8 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
         load_libraries(plan.configurations[LEARNER].algorithm.name, stop)
     plan = plan.with_computing_times()
     plan.write(run_dir)
-    reader = ProgressReader(run_dir, plan.configurations[ROBOT_BRIDGE].robot_bridge.steps)
+    steps = plan.configurations[ROBOT_BRIDGE].robot_bridge.steps
+    reader = ProgressReader(run_dir, steps)
     next_progress_s = 0.0
 
     def look(run: InProcessRun) -> None:
@@ -79,7 +80,8 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
     log = run_dir / "logs" / "train.log"
     try:
         with _log_to(log):
-            plan.begin().run(look)
+            begun = plan.begin()
+            begun.run(look)
     except ConfigError:
         if is_new:  # Nothing has begun: the corrected command may use the same folder.
             shutil.rmtree(run_dir, ignore_errors=True)
@@ -89,6 +91,8 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
     summary = summarise(read_record(run_dir))
     paths = [write_summary(run_dir, summary), write_curve(run_dir, summary)]
     if console:
+        if begun.told_to_stop and summary.values["steps"] < steps:
+            console.error(f"experiments.train: the run has ended early: {begun.told_to_stop}")
         for warning in summary.warnings:
             console.error(f"experiments.train: warning: {warning}")
         console.line(summary_text(summary.values))

@@ -142,7 +142,13 @@ def _network(training: Training, placement: Placement) -> tuple[list[str], str, 
             )
         return list(training.overrides), NO_NETWORK, None
     for_services, for_network = split_overrides(training.overrides)
-    return for_services, *choose_network(placement, training.network, for_network)
+    network, conditions = choose_network(placement, training.network, for_network)
+    if conditions and conditions.congestion_control:
+        raise ConfigError(
+            f"network.congestion_control = {conditions.congestion_control!r}: expected ''; virtual time has a TCP of "
+            "its own (docs/virtual-time.md), and only hosts in namespaces have the kernel's"
+        )
+    return for_services, network, conditions
 
 
 def _check_pacing(pacing: str, expected: str) -> None:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from common.errors import ConfigError
+from deploy.console import Console
 from deploy.episodes import EpisodeTable
 from experiments.train import Training, main, train
 
@@ -57,16 +59,23 @@ def test_the_same_seed_gives_the_same_run_over_a_bad_network_with_outages(bad, t
         assert (bad / file).read_bytes() == (tmp_path / file).read_bytes(), file
 
 
-def test_a_trace_that_stops_ends_the_run_in_order(tmp_path):
+def test_a_trace_that_stops_ends_the_run_in_order(tmp_path, capsys):
     trace = tmp_path / "short.csv"
     trace.write_text("time_s,delay_ms\n0.0,5\n1.0,10\n", encoding="utf-8")  # Each line holds for a second.
     network = tmp_path / "network.toml"
     network.write_text(f'[network]\ntrace = "{trace}"\ntrace_end = "stop"\n', encoding="utf-8")
-    values = train(small(tmp_path / "run", network=str(network)))
+    values = train(small(tmp_path / "run", network=str(network)), Console())
     # The link's 2 s of 25 cycles each, less the services' start; looked at once a second.
     assert 25 <= values["steps"] <= 75
     assert values["experience"]["lost"] == 0
     assert "short.csv is over after 2 s" in (tmp_path / "run" / "logs" / "train.log").read_text(encoding="utf-8")
+    assert f"the run has ended early: the trace {trace} is over after 2 s" in capsys.readouterr().err
+
+
+def test_a_congestion_control_is_refused_because_nobody_would_have_it(tmp_path):
+    with pytest.raises(ConfigError, match=r"congestion_control = 'cubic': expected ''; virtual time has a TCP"):
+        train(small(tmp_path / "run", "network.congestion_control='cubic'", network="wifi_bad"))
+    assert not (tmp_path / "run").exists()
 
 
 def test_another_seed_gives_another_run(bad, tmp_path):
