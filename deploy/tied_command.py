@@ -1,8 +1,8 @@
 """``python tied_command.py PARENT_PID COMMAND...``: becomes COMMAND, which gets SIGTERM if the parent dies.
 
 The launcher starts the services through it, so that none of them is left behind when the launcher is killed; a study
-starts the launcher through it. It is
-a program of its own because a launcher with threads must not run Python code between fork and exec.
+starts the launcher through it. It is a program of its own because a launcher with threads must not run Python code
+between fork and exec.
 """
 
 from __future__ import annotations
