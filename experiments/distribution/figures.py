@@ -46,9 +46,10 @@ def _draw_means(axis: Axes, panel: PanelResult) -> None:
         axis.errorbar([mean.mean], [row], xerr=error, fmt="o", capsize=4, color=colour)
     axis.set_yticks(range(len(names)), names)
     axis.invert_yaxis()
-    axis.set_xlim(left=0)
+    axis.set_xscale("log")  # Configurations differ by factors; of an interval that reaches 0 the rest is shown.
+    axis.set_xlim(1, panel.panel.steps)
     axis.set_xlabel("steps per goal over the run (dots: runs)")
-    axis.grid(alpha=0.3, axis="x")
+    axis.grid(alpha=0.3, axis="x", which="both")
 
 
 def _draw_curves(axis: Axes, panel: PanelResult) -> None:
