@@ -158,6 +158,11 @@ class Service:
         """The bridge's word that the run is over, once it has come."""
         return self._finished
 
+    @property
+    def ends_early(self) -> bool:
+        """True if this service, or the run, was asked to end: whoever asked is waiting."""
+        return self.stopping.is_set() or (self.finished is not None and self.finished.reason != "steps")
+
     def peer_age_s(self, service: str) -> float:
         """Seconds since the last status of ``service``; infinite before the first and after its goodbye."""
         peer = self._peers.get(service)
@@ -227,7 +232,7 @@ class Service:
         self.state = "draining"
         begun_ns = self.clock.now_ns()
         while True:
-            limit_s = STOP_TIMEOUT_S if self._ends_early() else DRAIN_TIMEOUT_S
+            limit_s = STOP_TIMEOUT_S if self.ends_early else DRAIN_TIMEOUT_S
             if (self.clock.now_ns() - begun_ns) / 1e9 > limit_s:
                 logger.warning("not drained after %.0f s; peers: %s", limit_s, self._peer_states())
                 return False
@@ -240,12 +245,9 @@ class Service:
             with self.wake:
                 self.clock.wait(self.wake, 0.02)
 
-    def _ends_early(self) -> bool:
-        return self.stopping.is_set() or (self._finished is not None and self._finished.reason != "steps")
-
     def _peer_states(self) -> dict[str, str]:
         # The network may be silent just now: whoever waits there may still need what this service has.
-        patience_s = GONE_AFTER_S if self._ends_early() else OUTAGE_S
+        patience_s = GONE_AFTER_S if self.ends_early else OUTAGE_S
         return {name: self.peer_state(name, patience_s) for name in topics.SERVICES if name != self.name}
 
     def _beat(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -61,6 +61,15 @@ class Algorithm(ABC):
 
         Keeps no reference to the arrays. Off-policy it does not wait for the device.
         """
+
+    def update_in_slices(self, minibatch: Minibatch) -> Iterator[None] | None:
+        """Return :meth:`update` in slices: each ``next`` computes one, and the iterator's end is the update's.
+
+        For an update that takes longer than a stop may wait, a second: the learner looks around between slices, and may
+        give the update up there, going back to the state before it. None, as here, where :meth:`update` is short.
+        Before the first ``next`` nothing changes; before the end, neither ``updates`` nor :meth:`metrics`.
+        """
+        return None
 
     @abstractmethod
     def metrics(self) -> dict[str, float]:

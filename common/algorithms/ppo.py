@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +25,8 @@ ShuffleSource = Callable[[int], Tensor]
 """N -> the numbers from 0 to N - 1 in random order."""
 NoiseSource = Callable[[int, int], Tensor]
 """(B, A) -> that many numbers from N(0, 1), in the algorithm's dtype and on its device."""
+Values = Generator[None, None, npt.NDArray[np.float64]]
+"""Slices whose outcome are values (N,)."""
 
 _MAX_LOG_RATIO = 20.0
 """Only a policy that another one acted for comes near this; beyond, the ratio would overflow."""
@@ -114,15 +116,21 @@ class PPO(ActorCritic):
 
     def update(self, minibatch: Minibatch) -> None:
         """Learn from a rollout: ``epochs`` times all its transitions, in minibatches of ``batch_size``."""
-        rollout = self._rollout(minibatch)
+        for _ in self.update_in_slices(minibatch):
+            pass
+
+    def update_in_slices(self, minibatch: Minibatch) -> Iterator[None]:
+        """See :class:`Algorithm`; a slice is what is computed for one minibatch of ``batch_size``."""
+        rollout, metrics = yield from self._rollout(minibatch)
         size = len(rollout.vector)
         for _ in range(self._config.epochs):
-            measured = [
-                (len(chosen) / size, self._take_gradient_step(rollout.select(chosen)))
-                for chosen in torch.split(self._shuffle(size), self._config.batch_size)
-            ]
+            measured = []
+            for chosen in torch.split(self._shuffle(size), self._config.batch_size):
+                yield
+                measured.append((len(chosen) / size, self._take_gradient_step(rollout.select(chosen))))
         # Of the last epoch: what the update has come to.
-        self._metrics |= {name: sum(share * step[name] for share, step in measured) for name in measured[0][1]}  # type: ignore[misc]
+        last = {name: sum(share * step[name] for share, step in measured) for name in measured[0][1]}
+        self._metrics = metrics | last  # type: ignore[assignment]
         self.updates += 1
 
     def _take_gradient_step(self, batch: _Rollout) -> dict[str, Tensor]:
@@ -149,24 +157,28 @@ class PPO(ActorCritic):
             "clipped": (ratio.detach() != clipped.detach()).to(self._dtype).mean(),
         }
 
-    def _rollout(self, minibatch: Minibatch) -> _Rollout:
-        """Compute values and advantages, under the parameters that the update begins with."""
+    def _rollout(self, minibatch: Minibatch) -> Generator[None, None, tuple[_Rollout, dict[str, Tensor]]]:
+        """Compute values and advantages, under the parameters that the update begins with; in slices.
+
+        Returns the rollout, and what was measured of it.
+        """
         frames = None if minibatch.frames is None else self._to_tensor(minibatch.frames)
         vector = self._vector(minibatch.proprioception, minibatch.previous_action)
-        value = self._values(frames, vector)
+        value = yield from self._values(frames, vector)
         goes_on = np.append(np.diff(minibatch.rows) == 1, False)
+        next_value = yield from self._next_values(minibatch, value, goes_on)
         terminated = minibatch.terminated.astype(np.float64)
         estimates = advantages(
             minibatch.reward.astype(np.float64),
             value,
-            self._next_values(minibatch, value, goes_on),
+            next_value,
             terminated,
             goes_on,
             discount=self._config.discount,
             gae_lambda=self._config.gae_lambda,
         )
         target = estimates + value
-        self._metrics = {
+        metrics = {
             name: torch.tensor(float(number))
             for name, number in {
                 "mean_value": value.mean(),
@@ -178,7 +190,7 @@ class PPO(ActorCritic):
             estimates = (estimates - estimates.mean()) / (estimates.std() + 1e-8)
         unit_action = self._actions.to_unit(minibatch.chosen_action, self._float)
         counts = (np.abs(unit_action) < LARGEST_ACTION).all(axis=1)
-        return _Rollout(
+        rollout = _Rollout(
             frames=frames,
             vector=vector,
             action=self._to_tensor(unit_action),
@@ -187,26 +199,27 @@ class PPO(ActorCritic):
             advantage=self._to_tensor(estimates.astype(self._float)),
             value_target=self._to_tensor(target.astype(self._float)),
         )
+        return rollout, metrics
 
     def _next_values(
         self, minibatch: Minibatch, value: npt.NDArray[np.float64], goes_on: npt.NDArray[np.bool_]
-    ) -> npt.NDArray[np.float64]:
+    ) -> Values:
         """Return the values (N,) of the next observations: those of the transitions that follow, where some do."""
         next_value = np.append(value[1:], 0.0)
         ends = ~goes_on
         frames = None if minibatch.next_frames is None else self._to_tensor(minibatch.next_frames[ends])
         vector = self._vector(minibatch.next_proprioception[ends], minibatch.action[ends])
-        next_value[ends] = self._values(frames, vector)
+        next_value[ends] = yield from self._values(frames, vector)
         return next_value
 
-    @torch.no_grad()
-    def _values(self, frames: Tensor | None, vector: Tensor) -> npt.NDArray[np.float64]:
-        """Return the values (N,) of observations; in portions, because the encoder's maps take much memory."""
-        size = self._config.batch_size
-        portions = [
-            self.critic(observation(self.encoder, None if frames is None else frames[at : at + size], portion))
-            for at, portion in zip(range(0, len(vector), size), torch.split(vector, size), strict=True)
-        ]
+    def _values(self, frames: Tensor | None, vector: Tensor) -> Values:
+        """Return the values (N,) of observations; in slices, also because the encoder's maps take much memory."""
+        size, portions = self._config.batch_size, []
+        for at, portion in zip(range(0, len(vector), size), torch.split(vector, size), strict=True):
+            yield
+            with torch.no_grad():
+                seen = observation(self.encoder, None if frames is None else frames[at : at + size], portion)
+                portions.append(self.critic(seen))
         values: npt.NDArray[np.float64] = torch.cat(portions).double().cpu().numpy()
         return values
 

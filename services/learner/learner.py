@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 from common import topics
@@ -20,6 +21,9 @@ logger = logging.getLogger(__name__)
 
 METRICS_S = 1.0
 """Period in which losses are read off the algorithm."""
+LAST_UPDATE_S = 20.0
+"""Longest that a running update is gone on with once the run's steps are done: the others, who wait for
+:data:`~common.service.DRAIN_TIMEOUT_S`, are to see the learner save."""
 
 
 class Learner:
@@ -94,10 +98,27 @@ class Learner:
 
     def _update(self, minibatch: Minibatch) -> None:
         due_ns = self._service.clock.now_ns() + self._min_update_ns
-        self._algorithm.update(minibatch)
+        slices = self._algorithm.update_in_slices(minibatch)
+        if slices is None:
+            self._algorithm.update(minibatch)
+        elif not self._complete(slices):
+            return
         self._wait_until(due_ns)
         if self._algorithm.updates % self._config.policy_push_interval == 0:
             self._push()
+
+    def _complete(self, slices: Iterator[None]) -> bool:
+        """Update, unless the end cannot wait for it: then the algorithm is what it was before, and False returned."""
+        service, clock = self._service, self._service.clock
+        before, give_up_ns = self._algorithm.state_dict(), None
+        for _ in slices:
+            if service.finished is not None and give_up_ns is None:
+                give_up_ns = clock.now_ns() + round(LAST_UPDATE_S * 1e9)
+            if service.ends_early or (give_up_ns is not None and clock.now_ns() >= give_up_ns):
+                self._algorithm.load_state_dict(before)
+                logger.info("the running update is given up; %d are complete", self._algorithm.updates)
+                return False
+        return True
 
     def _wait_until(self, due_ns: int) -> None:
         """A slower computer would still be updating."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import warnings
 from dataclasses import fields, replace
 
@@ -125,6 +126,39 @@ def test_read_only_minibatches_are_fine_and_none_is_changed(name, spec):
         algorithm.update(minibatch)
     for key, array in arrays.items():
         np.testing.assert_array_equal(array, getattr(kept, key))
+
+
+def test_an_update_in_slices_is_the_update_to_the_last_bit(name, spec):
+    at_once, in_slices = make_algorithm(name, spec), make_algorithm(name, spec)
+    for updates, minibatch in enumerate(minibatches(spec, 2)):
+        slices, metrics = in_slices.update_in_slices(minibatch), in_slices.metrics()
+        if slices is None:
+            pytest.skip("its update is short")
+        for _ in slices:
+            assert in_slices.updates == updates
+            assert in_slices.metrics() == metrics
+        at_once.update(minibatch)
+        assert_equal_states(at_once.state_dict(), in_slices.state_dict())
+        assert at_once.metrics() == in_slices.metrics()
+
+
+def test_an_update_given_up_after_any_slice_can_be_made_up_for(name, spec):
+    minibatch = minibatches(spec, 1)[0]
+    expected, algorithm = make_algorithm(name, spec), make_algorithm(name, spec)
+    expected.update(minibatch)
+    before, given_up, moved = algorithm.state_dict(), 0, False
+    while True:
+        slices = algorithm.update_in_slices(minibatch)
+        if slices is None:
+            pytest.skip("its update is short")
+        assert_equal_states(algorithm.state_dict(), before)
+        if sum(1 for _ in itertools.islice(slices, given_up + 1)) <= given_up:
+            break
+        moved |= not np.array_equal(algorithm.state_dict()["actor.1.weight"], before["actor.1.weight"])
+        algorithm.load_state_dict(before)
+        given_up += 1
+    assert moved  # there was something to go back from
+    assert_equal_states(algorithm.state_dict(), expected.state_dict())
 
 
 def test_metrics_are_finite_numbers_and_absent_before_the_first_update(name, spec):

@@ -34,6 +34,16 @@ def acted_out(policy, spec, rollout, frames, rng):
     )
 
 
+def prepared(ppo, minibatch):
+    """Return the rollout as an update begins with it."""
+    slices = ppo._rollout(minibatch)
+    while True:
+        try:
+            next(slices)
+        except StopIteration as end:
+            return end.value[0]
+
+
 def parameters(ppo, network):
     return {name: value for name, value in ppo.state_dict().items() if name.startswith(f"{network}.")}
 
@@ -76,7 +86,7 @@ def test_a_time_limit_bootstraps_and_the_goal_does_not():
     ppo = PPO(SPEC, replace(CONFIG, discount=0.9), seed=0, dtype=torch.float64)
     minibatch = make_minibatch(SPEC, np.random.default_rng(0), 8)  # no transition follows another
     for terminated in (np.zeros(8, np.float32), np.ones(8, np.float32)):
-        rollout = ppo._rollout(replace(minibatch, terminated=terminated))
+        rollout = prepared(ppo, replace(minibatch, terminated=terminated))
         with torch.no_grad():
             next_value = ppo.critic(ppo._vector(minibatch.next_proprioception, minibatch.action)).numpy()
         expected = minibatch.reward + 0.9 * (1.0 - terminated.astype(np.float64)) * next_value
@@ -93,7 +103,7 @@ def test_it_learns_from_the_chosen_action_and_not_from_the_applied_one():
         actors[name] = parameters(ppo, "actor")
     assert not np.array_equal(actors["one"]["actor.2.weight"], actors["other"]["actor.2.weight"])
     # The applied action is what the next observation has as its previous one, and nothing else.
-    batch = PPO(SPEC, config, seed=0)._rollout(rollout)
+    batch = prepared(PPO(SPEC, config, seed=0), rollout)
     low, high = SPEC.action_low, SPEC.action_high
     np.testing.assert_allclose(batch.action, 2 * (rollout.chosen_action - low) / (high - low) - 1, atol=1e-6)
 
@@ -141,6 +151,21 @@ def test_an_epoch_takes_each_transition_once_and_an_update_so_many_epochs():
     assert seen == [40] * 4
     assert taken == [16, 16, 8] * 4
     assert ppo.updates == 1
+
+
+@pytest.mark.parametrize("spec", [SPEC, VISUAL], ids=["no camera", "camera"])
+def test_a_slice_is_one_minibatch_of_values_or_one_gradient_step(spec):
+    ppo, computed = PPO(spec, replace(CONFIG, epochs=2), seed=0), []
+    critic, take = ppo.critic.forward, ppo._take_gradient_step
+    ppo.critic.forward = lambda seen: computed.append(len(seen)) or critic(seen)
+    ppo._take_gradient_step = lambda batch: computed.append("step") or take(batch)
+    rollout, slices = replace(make_rollout(spec, np.random.default_rng(0)), rows=np.arange(40)), []
+    for _ in ppo.update_in_slices(rollout):
+        slices.append(computed[:])
+        computed.clear()
+    slices.append(computed)
+    # Nothing before the first; the values of 40 observations; of the one next observation that is no other's.
+    assert slices == [[], [16], [16], [8], [1], *[["step", 16], ["step", 16], ["step", 8]] * 2]
 
 
 def test_longer_gradients_are_scaled_down():

@@ -56,6 +56,12 @@ def keeping(algorithm_class):
             self.minibatches.append(minibatch)
             super().update(minibatch)
 
+        def update_in_slices(self, minibatch):
+            slices = super().update_in_slices(minibatch)
+            if slices is not None:
+                self.minibatches.append(minibatch)
+            return slices
+
     return Keeping
 
 

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from common import topics
+from common.algorithms.ppo import PPO
+from common.algorithms.ppo_config import PPOConfig
 from common.algorithms.sac import SAC
 from common.algorithms.sac_config import SACConfig
 from common.clock import FakeClock
@@ -15,13 +17,14 @@ from common.policies import policy_from_weights
 from common.transport import InMemoryNetwork
 from services.learner.checkpoint import CHECKPOINT_FILE, POLICY_FILE, restore
 from services.learner.config import LearnerSettings
-from services.learner.learner import Learner
+from services.learner.learner import LAST_UPDATE_S, Learner
 from tests.helpers import eventually, make_spec
 from tests.reference.tasks import make_minibatch
 from tests.services.builders import Peer, SoloService
 
 SPEC = make_spec(camera=False)
 CONFIG = SACConfig(hidden_size=32, batch_size=8, policy_push_interval=5)
+SETTINGS = LearnerSettings()
 
 
 def make_algorithm(seed=0, config=CONFIG):
@@ -54,7 +57,16 @@ class ListedMinibatches:
 class Scene:
     """A learner that runs on the test's thread until its minibatches are used up."""
 
-    def __init__(self, directory, count, between=lambda given: None, algorithm=None, version=0, config=CONFIG) -> None:
+    def __init__(
+        self,
+        directory,
+        count,
+        between=lambda given: None,
+        algorithm=None,
+        version=0,
+        config=CONFIG,
+        settings=SETTINGS,
+    ) -> None:
         self.clock = FakeClock()
         self.network = InMemoryNetwork()
         self.service = SoloService(topics.LEARNER, self.network, directory, self.clock)
@@ -63,7 +75,7 @@ class Scene:
         self.algorithm = algorithm or make_algorithm(config=config)
         self.source = ListedMinibatches(count, between)
         self.source.service = self.service
-        self.learner = Learner(self.service, self.algorithm, config, LearnerSettings(), self.source, version)
+        self.learner = Learner(self.service, self.algorithm, config, settings, self.source, version)
 
     def run(self):
         self.learner.run()
@@ -232,3 +244,134 @@ def test_a_checkpoint_is_written_on_command(tmp_path):
     scene = Scene(tmp_path, 3, between)
     scene.run()
     assert replies[0].accepted
+
+
+# ---------------------------------------------------------------------- updates in slices
+
+SLICED = PPOConfig(hidden_size=16, rollout_length=8, batch_size=4, epochs=3, replay_capacity=100)
+SLICES = 2 + 2 + 3 * 2
+"""Of a rollout whose transitions do not follow each other: values, next values, gradient steps."""
+
+
+class SlicedScene(Scene):
+    """A PPO learner; the test is called before each slice, with the number of the update and of the slice."""
+
+    def __init__(self, directory, count, before_slice=lambda update, number: None, **settings) -> None:
+        super().__init__(
+            directory, count, self._wait, PPO(SPEC, SLICED, seed=0), 0, SLICED, LearnerSettings(**settings)
+        )
+        self.slices, self.states = 0, [self.algorithm.state_dict()]
+        whole = self.algorithm.update_in_slices
+
+        def update_in_slices(minibatch):
+            for number, _ in enumerate(whole(minibatch)):
+                before_slice(self.algorithm.updates, number)
+                yield
+                self.slices += 1
+
+        self.algorithm.update_in_slices = update_in_slices
+
+    def _wait(self, given) -> None:
+        eventually(lambda: len(self.policies) >= self.algorithm.updates)
+        self.states.append(self.algorithm.state_dict())
+
+
+def at_once(count, seed=0):
+    """The algorithm after ``count`` rollouts of the source, each learnt from in one call."""
+    algorithm, rng = PPO(SPEC, SLICED, seed=0), np.random.default_rng(seed)
+    for _ in range(count):
+        algorithm.update(make_minibatch(SPEC, rng, batch_size=8))
+    return algorithm
+
+
+def assert_equal(got, expected):
+    assert got.keys() == expected.keys()
+    for name, value in expected.items():
+        np.testing.assert_array_equal(got[name], value, err_msg=name)
+
+
+def saved(directory):
+    """What a learner that is started in ``directory`` goes on from: version, algorithm, and the policy beside it."""
+    algorithm = PPO(SPEC, SLICED, seed=9)
+    version = restore(directory, algorithm)
+    return version, algorithm, decode((directory / POLICY_FILE).read_bytes(), PolicyWeights)
+
+
+def test_what_is_pushed_after_the_slices_is_what_one_call_learns(tmp_path):
+    scene = SlicedScene(tmp_path, 3).run()
+    assert scene.slices == 3 * SLICES
+    assert pushed(scene) == [(1, 1), (2, 2), (3, 3)]
+    for updates, weights in enumerate(scene.policies, start=1):
+        assert weights.digest == at_once(updates).policy_weights(updates, "float32").digest
+    assert_equal(scene.algorithm.state_dict(), at_once(3).state_dict())
+
+
+def test_a_stop_command_between_slices_is_obeyed_before_the_next_one(tmp_path):
+    def stop(update, number):
+        if (update, number) == (1, 7):
+            assert not np.array_equal(scene.algorithm.state_dict()["actor.0.weight"], scene.states[2]["actor.0.weight"])
+            assert scene.peer.command(topics.LEARNER, "stop").accepted
+
+    scene = SlicedScene(tmp_path, 5, stop)
+    scene.run()
+    assert scene.slices == SLICES + 7
+    assert scene.algorithm.updates == 1
+    assert pushed(scene) == [(1, 1)]
+    # What is left on disk is whole: the last complete update, and its policy under the version it was pushed with.
+    version, algorithm, policy = saved(tmp_path)
+    assert (version, policy.version, policy.updates) == (1, 1, 1)
+    assert policy.digest == scene.policies[0].digest
+    assert_equal(algorithm.state_dict(), at_once(1).state_dict())
+
+
+def test_after_a_stop_in_an_update_the_same_rollout_is_learnt_from_as_if_nothing_had_happened(tmp_path):
+    scene = SlicedScene(tmp_path, 5, lambda update, number: number == 8 and update == 1 and scene.service.stop("test"))
+    scene.run()
+    _, algorithm, _ = saved(tmp_path)
+    rng = np.random.default_rng(0)
+    _, second = (make_minibatch(SPEC, rng, batch_size=8) for _ in range(2))
+    algorithm.update(second)
+    assert_equal(algorithm.state_dict(), at_once(2).state_dict())
+
+
+def test_a_checkpoint_asked_for_in_an_update_is_that_of_its_end(tmp_path):
+    def ask(update, number):
+        assert update > 0 or not (tmp_path / CHECKPOINT_FILE).exists()
+        if (update, number) == (0, 5):
+            assert scene.peer.command(topics.LEARNER, "checkpoint").accepted
+        if (update, number) == (1, 0):
+            eventually((tmp_path / CHECKPOINT_FILE).exists)
+            version, algorithm, policy = saved(tmp_path)
+            assert (version, policy.version) == (1, 1)
+            assert_equal(algorithm.state_dict(), at_once(1).state_dict())
+            seen.append(update)
+
+    seen = []
+    scene = SlicedScene(tmp_path, 2, ask)
+    scene.run()
+    assert seen == [1]
+
+
+@pytest.mark.parametrize(
+    ("reason", "goes_on_s", "updates"),
+    [("steps", LAST_UPDATE_S - 0.1, 1), ("steps", LAST_UPDATE_S, 0), ("stopped", 0.0, 0)],
+)
+def test_the_end_of_the_steps_lets_a_running_update_end_if_that_is_soon(tmp_path, reason, goes_on_s, updates):
+    def finish(update, number):
+        if number == 4:
+            scene.service.finished_message = Finished(1, 100, reason)
+        if number == 6:
+            scene.clock.advance(goes_on_s)
+
+    scene = SlicedScene(tmp_path, 5, finish)
+    scene.run()
+    assert scene.algorithm.updates == updates
+    assert_equal(saved(tmp_path)[1].state_dict(), at_once(updates).state_dict())
+    assert scene.service.state == "drained"
+
+
+def test_the_least_time_of_an_update_is_that_of_all_its_slices(tmp_path):
+    scene = SlicedScene(tmp_path, 3, lambda update, number: scene.clock.advance(0.1), min_update_s=2.0)
+    began_ns = scene.clock.now_ns()
+    scene.run()
+    assert scene.clock.now_ns() - began_ns == 3 * 2_000_000_000
