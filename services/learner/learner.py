@@ -116,7 +116,7 @@ class Learner:
                 give_up_ns = clock.now_ns() + round(LAST_UPDATE_S * 1e9)
             if service.ends_early or (give_up_ns is not None and clock.now_ns() >= give_up_ns):
                 self._algorithm.load_state_dict(before)
-                logger.info("the running update is given up; %d are complete", self._algorithm.updates)
+                logger.info("update %d is given up: the end does not wait for it", self._algorithm.updates + 1)
                 return False
         return True
 
