@@ -39,8 +39,8 @@ class Spy:
         for policy in (NumpyPolicy, TorchPolicy):
             self._listen(monkeypatch, policy, "act", self._hear_observation)
         self._listen(monkeypatch, Actor, "_remember", self._hear_answer)
-        for algorithm in (SAC, PPO):
-            self._listen(monkeypatch, algorithm, "update", self.minibatches.append)
+        for algorithm, update in ((SAC, "update"), (PPO, "update_in_slices")):
+            self._listen(monkeypatch, algorithm, update, self.minibatches.append)
 
     @staticmethod
     def _listen(monkeypatch, owner, name, hear) -> None:
