@@ -31,8 +31,9 @@ from deploy.ports import reserved_ports
 
 BATCH_SIZE = 256
 MESSAGE_BYTES = 100_000_000
-PREFETCH = 2
-"""Minibatches asked for ahead of need, as the learner's default."""
+PREFETCH = 3
+"""Minibatches asked for ahead of need, on both sides: one in use, one being gathered, one asked for. With fewer each
+gather waits for its row numbers; a learner, whose updates take longer than either, does not notice."""
 FIRST_S, NEXT_S = 20.0, 30.0
 """Longest time that the first minibatch, and each later one, may take."""
 
