@@ -52,8 +52,8 @@ def test_each_run_has_a_key_and_a_folder_of_its_own():
         assert len({job.key for job in jobs}) == len({job.folder for job in jobs}) == len(jobs)
 
 
-def test_small_takes_two_cores_an_hour_and_a_quarter():
-    assert sum(map(SMALL.expected_s, SMALL.jobs())) / 2 < 80 * 60
+def test_small_takes_two_cores_two_hours():
+    assert sum(map(SMALL.expected_s, SMALL.jobs())) / 2 < 120 * 60
 
 
 def test_thesis_has_twenty_seeds_of_states_and_five_of_images_at_least():
