@@ -195,6 +195,8 @@ def _decoder(hint: Any, bounds: Bounds = _UNBOUNDED) -> Decoder:
         }
     if origin is list:
         element = _decoder(arguments[0])
+        if arguments[0] in (str, int):
+            return _plain_list_decoder(arguments[0], element)
         return lambda value, where, sizes: [element(item, where, sizes) for item in _instance(value, list, where)]
     if isinstance(hint, type) and is_dataclass(hint):
         return lambda value, where, sizes: _decode_dataclass(hint, value, where, sizes)
@@ -209,6 +211,18 @@ def _decoder(hint: Any, bounds: Bounds = _UNBOUNDED) -> Decoder:
     return lambda value, where, sizes: (
         value if type(value) is hint and low <= value <= high else _number(hint, value, where, bounds)
     )
+
+
+def _plain_list_decoder(kind: type, element: Decoder) -> Decoder:
+    """Return what decodes a list of texts or of any integers: if their types are right, so are they."""
+    kinds = {kind}
+
+    def decode_list(value: Any, where: str, sizes: Sizes) -> list[Any]:
+        if type(value) is list and kinds.issuperset(map(type, value)):
+            return value
+        return [element(item, where, sizes) for item in _instance(value, list, where)]
+
+    return decode_list
 
 
 def _instance(value: Any, cls: type, where: str) -> Any:

@@ -70,6 +70,8 @@ class ActorCritic(Algorithm):
         self._generator.manual_seed(update_seed)
         self._metrics: dict[str, Tensor] = {}
         self.adams: dict[str, Adam] = {}
+        self._log_std_bounds = np.array([config.log_std_low, config.log_std_high], np.float32)
+        self._shared: dict[str, npt.NDArray[Any]] = {}
 
         sizes = spec.dimensions
         self.vector_size = sizes.P + sizes.A
@@ -103,10 +105,8 @@ class ActorCritic(Algorithm):
                 raise MessageError(
                     f"after {self.updates} updates {name} is {value}: learning has diverged, nothing is pushed any more"
                 )
-        parameters = {name: _array(value) for name, value in self._policy_parameters.items()}
-        bounds = [self._config.log_std_low, self._config.log_std_high]
         return encode_weights(
-            parameters | {"log_std_bounds": np.array(bounds)},
+            self._policy_arrays() | {"log_std_bounds": self._log_std_bounds},
             version=version,
             updates=self.updates,
             algorithm=self.NAME,
@@ -134,6 +134,13 @@ class ActorCritic(Algorithm):
                 tensor.copy_(torch.from_numpy(np.array(arrays[name])))
         self._generator.set_state(state["random_state"])
         self.updates = int(state["updates"])
+
+    def _policy_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Return the policy's parameters by name: on the CPU always the same arrays, whose memory they are."""
+        if self._device.type == "cpu" and self._shared:
+            return self._shared
+        self._shared = {name: _array(value) for name, value in self._policy_parameters.items()}
+        return self._shared
 
     def _state(self) -> dict[str, Tensor]:
         """Return everything an update reads and writes: tensors by name, not copies, except the last two."""

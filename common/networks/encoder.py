@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from common.messages import Float32Array
 from common.networks.sizes import CHANNELS, KERNEL, map_size
 
 
@@ -59,11 +61,12 @@ class Encoder(nn.ModuleList):
         return encode_frames(frames, layers, self.positions)
 
 
+Kernel = TypeVar("Kernel", Tensor, Float32Array)
 Layer = tuple[Tensor, Tensor | None, int]
 """Kernel, bias and stride of a convolution."""
 
 
-def for_bytes(kernel: Tensor) -> Tensor:
+def for_bytes(kernel: Kernel) -> Kernel:
     """Return the first kernel for pixels from 0 to 255; the trained one expects them from 0 to 1.
 
     Dividing the kernel is cheaper than dividing the images, and 0..255 is exact in bfloat16.

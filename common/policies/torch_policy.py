@@ -59,12 +59,10 @@ class TorchPolicy:
 def _layers(parameters: Mapping[str, Float32Array], strides: Sequence[int]) -> list[Layer]:
     layers: list[Layer] = []
     for i, stride in enumerate(strides):
+        kernel, bias = parameters[f"encoder.{i}.weight"], parameters.get(f"encoder.{i}.bias")
         # Copies, because what came is read-only.
-        kernel = torch.from_numpy(parameters[f"encoder.{i}.weight"].copy())
-        bias = parameters.get(f"encoder.{i}.bias")
-        layers.append(
-            (for_bytes(kernel) if i == 0 else kernel, None if bias is None else torch.from_numpy(bias.copy()), stride)
-        )
+        kernel = for_bytes(kernel) if i == 0 else kernel.copy()
+        layers.append((torch.from_numpy(kernel), None if bias is None else torch.from_numpy(bias.copy()), stride))
     return layers
 
 

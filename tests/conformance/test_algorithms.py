@@ -195,6 +195,19 @@ def test_what_has_diverged_is_not_pushed_any_more(name, spec):
         algorithm.encoded_policy(1, "float32")
 
 
+def test_pushed_weights_are_those_of_the_moment(name, spec):
+    algorithm = make_algorithm(name, spec)
+    beginning = algorithm.state_dict()
+    for state in (None, beginning):
+        algorithm.update(minibatches(spec, 1)[0])
+        if state is not None:
+            algorithm.load_state_dict(state)
+        weights, now = algorithm.policy_weights(1, "float32"), algorithm.state_dict()
+        expected = b"".join(now[parameter].tobytes() for parameter in weights.names[:-1])
+        assert weights.buffer.tobytes()[: len(expected)] == expected
+        assert np.array_equal(now["actor.2.weight"], beginning["actor.2.weight"]) == (state is not None)
+
+
 def test_pushed_weights_do_not_change_with_later_updates(name, spec):
     algorithm = make_algorithm(name, spec)
     weights = algorithm.policy_weights(1, "float32")
