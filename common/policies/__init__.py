@@ -53,6 +53,10 @@ def initial_policy(
         np.random.default_rng(seed),
         zero_initialised_head=zero_initialised_head,
     )
+    if spec.has_camera:
+        from common.policies.fused_check import load
+
+        load()  # compiled now, not when the first policy comes
     return _policy(spec, parameters, 0, encoder_strides)
 
 

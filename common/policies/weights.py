@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -36,21 +37,25 @@ _HEAD_WEIGHT, _HEAD_BIAS = "actor.2.weight", "actor.2.bias"
 _WIRE_DTYPES: dict[str, np.dtype[Any]] = {"float32": np.dtype("<f4"), "float16": np.dtype("<f2")}
 
 
-def parameter_shapes(spec: TaskSpec, hidden_size: int, encoder_strides: Sequence[int]) -> dict[str, list[int]]:
+def parameter_shapes(spec: TaskSpec, hidden_size: int, encoder_strides: Sequence[int]) -> Mapping[str, list[int]]:
     """Return the names and shapes of a policy's parameters, in the order of the buffer."""
     sizes = spec.dimensions
+    return _shapes(sizes.A, sizes.P, sizes.S * sizes.C, hidden_size, len(encoder_strides))
+
+
+@lru_cache(maxsize=16)  # all policies of a task have the same
+def _shapes(actions: int, proprioception: int, channels: int, hidden_size: int, layers: int) -> Mapping[str, list[int]]:
     shapes: dict[str, list[int]] = {}
-    inputs = sizes.P + sizes.A
-    if spec.has_camera:
-        channels = sizes.S * sizes.C
-        for layer in range(len(encoder_strides)):
+    inputs = proprioception + actions
+    if channels:
+        for layer in range(layers):
             shapes[f"encoder.{layer}.weight"] = [CHANNELS, channels, KERNEL, KERNEL]
-            if layer < len(encoder_strides) - 1:
+            if layer < layers - 1:
                 shapes[f"encoder.{layer}.bias"] = [CHANNELS]
             channels = CHANNELS
         inputs += FEATURES
     for layer, (rows, columns) in enumerate(
-        [(hidden_size, inputs), (hidden_size, hidden_size), (2 * sizes.A, hidden_size)]
+        [(hidden_size, inputs), (hidden_size, hidden_size), (2 * actions, hidden_size)]
     ):
         shapes[f"actor.{layer}.weight"] = [rows, columns]
         shapes[f"actor.{layer}.bias"] = [rows]
@@ -169,7 +174,7 @@ def unpack_weights(weights: PolicyWeights, expected: Mapping[str, list[int]]) ->
             belongs to another network than ``expected``.
     """
     wire = _wire_dtype(weights.dtype)
-    digest = _digest(weights.buffer)
+    digest, is_finite = _looked_at(weights, wire)
     if weights.digest != digest:
         raise MessageError(f"policy weights {weights.version}: expected digest {weights.digest}, got {digest}")
     got = dict(zip(weights.names, weights.shapes, strict=False))
@@ -186,7 +191,7 @@ def unpack_weights(weights: PolicyWeights, expected: Mapping[str, list[int]]) ->
             f"policy weights {weights.version}: expected {size * wire.itemsize} bytes, got {weights.buffer.nbytes}"
         )
     flat = as_aligned(weights.buffer.view(wire)).astype(np.float32, copy=False)
-    if not _all_finite(flat):
+    if not (_all_finite(flat) if is_finite is None else is_finite):
         raise MessageError(f"policy weights {weights.version}: expected finite numbers, got NaN or infinity")
     parameters: dict[str, Float32Array] = {}
     start = 0
@@ -201,6 +206,15 @@ def _wire_dtype(dtype: str) -> np.dtype[Any]:
     if dtype not in _WIRE_DTYPES:
         raise MessageError(f"policy weights: expected dtype in {list(_WIRE_DTYPES)}, got {dtype!r}")
     return _WIRE_DTYPES[dtype]
+
+
+def _looked_at(weights: PolicyWeights, wire: np.dtype[Any]) -> tuple[str, bool | None]:
+    """Return the digest of the buffer and whether its numbers are finite; None: they are still to be looked at."""
+    if weights.encoder_strides.size and wire == np.float32:
+        from common.policies.fused_check import digest_and_finite  # LLVM: only policies with camera pay for it
+
+        return digest_and_finite(weights.buffer)
+    return _digest(weights.buffer), None
 
 
 def _all_finite(values: npt.NDArray[Any]) -> bool:

@@ -102,6 +102,15 @@ def test_a_buffer_of_the_wrong_length_is_refused():
         unpack_weights(with_buffer(weights, values), SHAPES)
 
 
+@pytest.mark.parametrize("at", [0, 5000, -1])
+def test_a_changed_bit_is_refused_wherever_it_is(at):
+    weights = make_weights()
+    buffer = weights.buffer.copy()
+    buffer[at] ^= 1
+    with pytest.raises(MessageError, match=f"expected digest {weights.digest}, got"):
+        unpack_weights(replace(weights, buffer=buffer), SHAPES)
+
+
 @pytest.mark.parametrize("bits", [0x7F800000, 0xFF800000, 0x7FC00000, 0xFFC00001], ids=["inf", "-inf", "nan", "-nan"])
 @pytest.mark.parametrize("at", [0, 7, -1])
 def test_a_number_that_is_not_finite_is_refused_although_its_digest_fits(bits, at):

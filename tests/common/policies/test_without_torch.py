@@ -28,6 +28,7 @@ weights = pack_weights(
 )
 action = policy_from_weights(spec, weights).act(observation, rng).action
 assert action.shape == (2,)
+assert not {"llvmlite", "numba"} & set(sys.modules)
 """
 
 
