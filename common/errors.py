@@ -31,3 +31,7 @@ class RingError(RelodError):
 
 class ServiceError(RelodError):
     """A service cannot go on; it ends with exit code 1 and this message."""
+
+
+class CameraError(ServiceError):
+    """A camera cannot be opened, or what it shows cannot be used."""

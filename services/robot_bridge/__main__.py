@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from common import topics
+from common.errors import ConfigError
 from common.priority import BRIDGE_PRIORITY, run_before_others
 from common.record import read_parts, settle_parts
 from common.run_service import end_process, run_service
@@ -15,8 +16,9 @@ from common.service import Service
 from common.surviving_counts import SurvivingCounts
 from services.robot_bridge.bookkeeping import Totals
 from services.robot_bridge.bridge import SURVIVING_COUNTS, RobotBridge
+from services.robot_bridge.cameras import Camera, PictureSize, open_camera
 from services.robot_bridge.config import RobotBridgeConfig
-from services.robot_bridge.tasks import load_task
+from services.robot_bridge.tasks import Task, load_task
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +37,7 @@ def serve(service: Service, config: RobotBridgeConfig) -> None:
         # A restarted bridge must not repeat the starts of the one before.
         rng=np.random.default_rng([config.run.seed, totals.attempts]),
     )
+    _give_camera(task, config, service)
     surviving_counts = SurvivingCounts(topics.ROBOT_BRIDGE, service.incarnation, SURVIVING_COUNTS)
     service.closing.callback(surviving_counts.close)
     bridge = RobotBridge(service, task, settings, totals, latched, surviving_counts)
@@ -42,6 +45,25 @@ def serve(service: Service, config: RobotBridgeConfig) -> None:
     if settings.real_time_priority and settings.pacing == "realtime":
         logger.info("%s", run_before_others(BRIDGE_PRIORITY))
     bridge.run()
+
+
+def _give_camera(task: Task, config: RobotBridgeConfig, service: Service) -> None:
+    """Open the camera that is configured, if one is, and let the task see through it."""
+    if not config.camera.name:
+        return
+    if config.robot_bridge.pacing != "realtime":
+        raise ConfigError(
+            f"[camera] name = {config.camera.name!r}: expected robot_bridge.pacing = realtime, got "
+            f"{config.robot_bridge.pacing}; a camera's time does not wait for answers"
+        )
+
+    def opened(size: PictureSize) -> Camera:
+        choice = config.camera
+        camera = open_camera(choice.name, choice.overrides, config.cameras.rows, size=size, clock=service.clock)
+        service.closing.callback(camera.close)
+        return camera
+
+    task.use_camera(opened)
 
 
 def _earlier(directory: Path) -> tuple[Totals, str | None]:

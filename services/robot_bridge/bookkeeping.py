@@ -62,9 +62,9 @@ class CycleCounts:
 class Ledger:
     """Counts action cycles into attempts and episodes.
 
-    An episode ends only at the goal. A time limit calls a reset that takes ``reset_steps`` cycles; they count into
-    the episode's length and return and into the run's steps, never into a transition. A task without goal has one
-    attempt per episode, and its resets count into the run's steps only.
+    An episode ends only at the goal. A time limit, or a stalled camera, calls a reset that takes ``reset_steps``
+    cycles; they count into the episode's length and return and into the run's steps, never into a transition. A task
+    without goal has one attempt per episode, and its resets count into the run's steps only.
     """
 
     def __init__(self, spec: TaskSpec, totals: Totals | None = None) -> None:
@@ -89,12 +89,15 @@ class Ledger:
         self.episode = self.totals.episodes
         self.step_index = 0
 
-    def end_cycle(self, reward: float, terminated: bool) -> tuple[bool, EpisodeResult | None]:
-        """Count one action cycle; return whether the time limit truncates the attempt, and the ended episode."""
+    def end_cycle(self, reward: float, terminated: bool, cut_short: bool = False) -> tuple[bool, EpisodeResult | None]:
+        """Count one action cycle; return whether the attempt is truncated, and the ended episode.
+
+        The time limit truncates an attempt, or ``cut_short`` does: it cannot go on, for another reason than the goal.
+        """
         self._attempts += self.step_index == 0
         self.step_index += 1
         self._count(reward, acted=True)
-        truncated = not terminated and self.step_index >= self._spec.time_limit_steps
+        truncated = not terminated and (cut_short or self.step_index >= self._spec.time_limit_steps)
         ended = terminated or (truncated and not self._spec.has_goal)
         return truncated, self._end_episode() if ended else None
 

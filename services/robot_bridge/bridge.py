@@ -27,6 +27,7 @@ from common.service import Service
 from common.surviving_counts import SurvivingCounts
 from services.robot_bridge.answers import Answers
 from services.robot_bridge.bookkeeping import CycleCounts, EpisodeResult, Ledger, Totals
+from services.robot_bridge.camera_watch import CameraWatch
 from services.robot_bridge.config import RobotBridgeSettings
 from services.robot_bridge.tasks.base import Task
 from services.robot_bridge.time_steps import CommandInForce, TimeStepStream, announced_spec
@@ -65,6 +66,7 @@ class RobotBridge:
         self._keeper = CycleKeeper(self._cycle_ns)
         self._watchdog = Watchdog(round(settings.stop_after * 1e9))
         self._watchdog.latched = latched
+        self._camera_watch = CameraWatch(round(settings.camera_stall_after * 1e9))
         self._ledger = Ledger(self._spec, totals)
         self.counts = CycleCounts()
         self._surviving_counts = surviving_counts
@@ -148,7 +150,7 @@ class RobotBridge:
         answered = self._in_force.source is ActionSource.POLICY
         self.counts.unanswered += not answered
         outcome = self._task.outcome()
-        truncated, episode = self._ledger.end_cycle(outcome.reward, outcome.terminated)
+        truncated, episode = self._ledger.end_cycle(outcome.reward, outcome.terminated, self._camera_stalls())
         self._observe(outcome.reward, outcome.terminated, truncated)
         if answered:
             self._in_force = replace(self._in_force, source=ActionSource.HELD)
@@ -311,21 +313,35 @@ class RobotBridge:
         )
         self._answers.expect(time_step, self._time_steps.sent_ns)
 
+    def _camera_stalls(self) -> bool:
+        """True while the newest camera frame is too old to act by."""
+        return self._camera_watch.look(self._task.newest_frame_ns(), self._world_ns)
+
+    def _waits_for_camera(self) -> bool:
+        """True while no attempt may start for want of a camera frame that is new enough."""
+        # In lockstep the camera's time stands still while anyone waits: attempts bring it on, however short they are.
+        if not self._realtime or self._task.newest_frame_ns() is None:
+            return False
+        self._advance_world()
+        return self._camera_stalls()
+
     # ------------------------------------------------------------------ beginning and end
 
     def _over(self) -> bool:
         return self._service.stopping.is_set() or self._ledger.totals.steps >= self._settings.steps
 
     def _ready(self) -> bool:
-        """True while an attempt may start: actor and replay are there and an answer has come."""
-        if self._watchdog.latched or any(self._service.peer_age_s(p) > self._settings.peer_grace for p in PEERS):
+        """True while an attempt may start: actor, replay and camera are there and an answer has come."""
+        gone = any(self._service.peer_age_s(peer) > self._settings.peer_grace for peer in PEERS)
+        if self._watchdog.latched or gone or self._waits_for_camera():
             self._engaged = False
         return self._engaged
 
     def _engage(self) -> None:
-        """Wait for actor and replay, then publish one observation; its answer shows that the ring is closed."""
+        """Wait for actor, replay and camera, then publish one observation; its answer shows that the ring is closed."""
         self._task.stop()
         waiting = [peer for peer in PEERS if self._service.peer_state(peer) not in ("running", "draining")]
+        waiting += ["camera"] if self._waits_for_camera() else []
         if waiting or self._watchdog.latched:
             reason = self._watchdog.latched or " and ".join(waiting)
             self._waits_for = "resume" if reason in ("pause", "e_stop") else reason
@@ -411,6 +427,7 @@ class RobotBridge:
             "unacknowledged": self._time_steps.journal.unacknowledged,
             "given_up": self._time_steps.journal.given_up,
             "stops": self._watchdog.stops,
+            "camera_stalls": self._camera_watch.stalls,
             **({} if self._last_return is None else {"last_return": self._last_return}),
         }
 

@@ -29,6 +29,22 @@ class TaskTable:
 
 
 @dataclass(frozen=True)
+class CameraSettings:
+    """``[camera]``: what a task sees through that has no camera of its own. Other keys are the camera's settings."""
+
+    name: str = setting("")
+    """Kind of camera, a key of the camera table; empty: none."""
+    overrides: dict[str, Any] = setting(rest=True)
+
+
+@dataclass(frozen=True)
+class CameraTable:
+    """``[cameras]``: more rows for the camera table, ``name = "module:Class"``."""
+
+    rows: dict[str, Any] = setting(rest=True)
+
+
+@dataclass(frozen=True)
 class RobotBridgeSettings(JournalSettings):
     """``[robot_bridge]``: the action cycle."""
 
@@ -43,6 +59,9 @@ class RobotBridgeSettings(JournalSettings):
     about a tenth of the bytes; actor and learner see what it leaves)."""
     stop_after: float = setting(0.5, low=0.01, high=60.0)
     """The watchdog stops the robot after this long without a fresh action, seconds."""
+    camera_stall_after: float = setting(0.5, low=0.01, high=60.0)
+    """An attempt is truncated when the newest camera frame is older than this, seconds, and none begins before the
+    camera is back; for tasks with a camera that can stall."""
     real_time_priority: bool = setting(True)
     """Run before ordinary processes, where the system allows it; not in lockstep."""
     peer_grace: float = setting(5.0, low=0.1, high=3600.0)
@@ -58,4 +77,6 @@ class RobotBridgeConfig:
     clock: ClockSettings
     task: TaskSettings
     tasks: TaskTable
+    camera: CameraSettings
+    cameras: CameraTable
     robot_bridge: RobotBridgeSettings

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from common.config import build_section
 from common.errors import ConfigError
+from services.robot_bridge.class_table import load_class
 from services.robot_bridge.tasks.base import Outcome, SensorReading, Task
 
 TASKS = {
@@ -52,23 +52,10 @@ def load_task(
     Raises:
         ConfigError: unknown task, preset or setting, or a value out of range.
     """
-    task_class = _load_class(name, {**TASKS, **(rows or {})})
+    task_class = load_class(Task, name, {**TASKS, **(rows or {})}, "task")
     preset = preset or next(iter(task_class.PRESETS))
     if preset not in task_class.PRESETS:
         raise ConfigError(f"[task] preset = {preset!r}: task {name} has the presets {', '.join(task_class.PRESETS)}")
     values = {**task_class.PRESETS[preset], **(overrides or {})}
     settings: Any = build_section(task_class.SETTINGS, values, f"[task] {name}")
     return task_class(settings, name=name, preset=preset, pacing=pacing, rng=rng)
-
-
-def _load_class(name: str, table: Mapping[str, Any]) -> type[Task]:
-    if name not in table:
-        raise ConfigError(f"[task] name = {name!r}: expected one of {', '.join(sorted(table))}")
-    module_name, _, class_name = str(table[name]).partition(":")
-    try:
-        task_class = getattr(importlib.import_module(module_name), class_name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"[tasks] {name} = {table[name]!r}: expected module:Class that imports: {error}") from error
-    if not (isinstance(task_class, type) and issubclass(task_class, Task)):
-        raise ConfigError(f"[tasks] {name} = {table[name]!r}: expected a subclass of Task")
-    return task_class

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
+from common.errors import ConfigError
 from common.messages import Float32Array, Int64Array, TaskSpec, UInt8Array
+from services.robot_bridge.cameras.base import Camera, PictureSize
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,23 @@ class Task(ABC):
     @abstractmethod
     def outcome(self) -> Outcome:
         """Judge the cycle that ended at the last :meth:`advance_to`."""
+
+    def use_camera(self, open_camera: Callable[[PictureSize], Camera]) -> None:
+        """See through a camera, opened with the size of the spec's frames, from now on; the task closes it.
+
+        Raises:
+            ConfigError: the task draws its frames itself, or has none.
+            CameraError: the camera cannot be used.
+        """
+        own = "draws its frames itself" if self.spec.has_camera else "has no camera"
+        raise ConfigError(f"[camera]: {self.spec.task} {own}; expected no camera, leave [camera] name empty")
+
+    def newest_frame_ns(self) -> int | None:
+        """When the newest camera frame was taken, on the clock of :meth:`advance_to`, whether it has been read or not.
+
+        The bridge truncates an attempt whose frames are too old. None: there is no camera that could stall.
+        """
+        return None
 
     def close(self) -> None:
         """Let go of the robot."""

@@ -1,11 +1,12 @@
 """Noise frames of a real camera's size: a load for links and buffers, and a check of what arrives.
 
-Noise cannot be compressed, and each frame carries its id, so that whoever receives it can tell which one it is.
-There is nothing to learn.
+Noise cannot be compressed, and each frame carries its id, so that whoever receives it can tell which one it is. With a
+``[camera]``, its frames take the place of the noise: a check that the camera keeps up. There is nothing to learn.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -13,6 +14,8 @@ import numpy as np
 
 from common.config import setting
 from common.messages import Float32Array, TaskSpec, UInt8Array
+from services.robot_bridge.cameras import Camera, PictureSize
+from services.robot_bridge.cameras.frame_feed import FrameFeed
 from services.robot_bridge.tasks.base import Outcome, SensorReading, Task
 
 _ID_BYTES = 8
@@ -25,7 +28,8 @@ class NoiseFramesSettings:
     height: int = setting(90, low=8, high=4096)
     width: int = setting(160, low=8, high=4096)
     frames_per_cycle: float = setting(1.0, low=0.0, high=8.0)
-    """New frames an action cycle brings on average; 1.2 is a 30 Hz camera at 25 cycles a second."""
+    """New frames an action cycle brings on average; 1.2 is a 30 Hz camera at 25 cycles a second. A
+    ``[camera]`` has a rate of its own."""
     time_limit: int = setting(100, low=1)
     reset_steps: int = setting(5, low=0)
     goal_probability: float = setting(0.0, low=0.0, high=1.0)
@@ -48,6 +52,8 @@ class NoiseFrames(Task):
         self._now_ns = 0
         self._next_frame_id = 0
         self._frames_due = 1.0
+        self._feed: FrameFeed | None = None
+        """Of the camera, if there is one."""
         self.spec = TaskSpec(
             task=name,
             preset=preset,
@@ -72,6 +78,8 @@ class NoiseFrames(Task):
 
     def begin_attempt(self) -> None:
         self.stop()
+        if self._feed:
+            self._feed.begin_attempt()
         # An attempt begins with a frame, whatever the camera's rate.
         self._frames_due = max(self._frames_due, 1.0)
 
@@ -83,8 +91,23 @@ class NoiseFrames(Task):
 
     def advance_to(self, now_ns: int) -> None:
         self._now_ns = max(now_ns, self._now_ns)
+        if self._feed:
+            self._feed.advance()
+
+    def use_camera(self, open_camera: Callable[[PictureSize], Camera]) -> None:
+        self._feed = FrameFeed(open_camera(PictureSize(*self._shape[:2])))
+
+    def newest_frame_ns(self) -> int | None:
+        return self._feed.newest_frame_ns if self._feed else None
+
+    def close(self) -> None:
+        super().close()
+        if self._feed:
+            self._feed.close()
 
     def read(self) -> SensorReading:
+        if self._feed:
+            return SensorReading(*self._feed.read(), proprioception=self._command)
         count = int(self._frames_due)
         self._frames_due += self._settings.frames_per_cycle - count
         ids = np.arange(self._next_frame_id, self._next_frame_id + count)

@@ -1,0 +1,36 @@
+"""Tables whose values are ``module:Class``: what is in them is imported when it is chosen, and not before."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from common.errors import ConfigError
+
+Base = TypeVar("Base")
+
+
+def load_class(base: type[Base], name: str, table: Mapping[str, Any], section: str) -> type[Base]:
+    """Return the class in row ``name`` of ``table``.
+
+    Args:
+        base: what it has to be a subclass of.
+        name: what was chosen, ``[section] name`` in the configuration.
+        table: name -> ``module:Class``; the configuration adds rows to it in ``[sections]``.
+        section: of the configuration.
+
+    Raises:
+        ConfigError: there is no such row, or it leads to no such class.
+    """
+    if name not in table:
+        raise ConfigError(f"[{section}] name = {name!r}: expected one of {', '.join(sorted(table))}")
+    row = f"[{section}s] {name} = {table[name]!r}"
+    module_name, _, class_name = str(table[name]).partition(":")
+    try:
+        found = getattr(importlib.import_module(module_name), class_name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"{row}: expected module:Class that imports: {error}") from error
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise ConfigError(f"{row}: expected a subclass of {base.__name__}")
+    return found
