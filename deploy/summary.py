@@ -64,6 +64,8 @@ def summarise(record: Record) -> Summary:
         notes.append(f"episodes.csv holds {len(record.episodes)} of the {episodes} completed episodes")
     for service, jumps in run_parts.clock_jumps(parts).items():
         notes.append(f"{service}: its clock and the bridge's jumped against each other ({jumps} x)")
+    if stalls := _count(parts.total(ROBOT_BRIDGE, "camera_stalls")):
+        notes.append(f"the camera stalled ({stalls} x): each time, the attempt was truncated")
     values = {
         "task": run.task if run else run_parts.newest_detail(parts, ROBOT_BRIDGE, "task"),
         "algorithm": run.algorithm if run else None,

@@ -199,6 +199,14 @@ def test_a_clock_that_jumped_is_noted(tmp_path: Path) -> None:
     assert notes == ["actor: its clock and the bridge's jumped against each other (3 x)"]
 
 
+def test_a_camera_that_stalled_is_noted(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    write_part(tmp_path, "robot_bridge", 141, counters={"camera_stalls": 2})
+    write_part(tmp_path, "robot_bridge", 142, counters={"camera_stalls": 1})
+    notes = summarise(read_record(tmp_path)).values["notes"]
+    assert "the camera stalled (3 x): each time, the attempt was truncated" in notes
+
+
 def test_in_simulated_time_an_action_has_no_age(tmp_path: Path) -> None:
     write_run(tmp_path)
     replace(RUN, mode="in_process").write(tmp_path)

@@ -96,3 +96,14 @@ def test_a_restarted_bridge_goes_on_from_the_totals_of_the_one_before():
     assert (ledger.episode, ledger.attempt) == (7, 9)
     _, episode = ledger.end_cycle(-1.0, terminated=True)
     assert episode == EpisodeResult(7, -1.0, length=1, attempts=1, steps=501, acted_steps=401)
+
+
+def test_an_attempt_that_is_cut_short_is_truncated_unless_the_goal_was_reached():
+    ledger = ledger_of(time_limit=10, reset_steps=2)
+    ledger.begin_attempt()
+    assert ledger.end_cycle(-1.0, terminated=False, cut_short=True) == (True, None)
+    reset(ledger, 2)
+    ledger.begin_attempt()
+    truncated, episode = ledger.end_cycle(-1.0, terminated=True, cut_short=True)
+    assert not truncated
+    assert (episode.undiscounted_return, episode.length, episode.attempts) == (-4.0, 4, 2)

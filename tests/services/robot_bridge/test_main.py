@@ -6,11 +6,12 @@ import pytest
 
 from common import topics
 from common.config import build_config
-from common.errors import ConfigError
+from common.errors import CameraError, ConfigError
 from common.transport import InMemoryNetwork
 from services.robot_bridge.__main__ import serve
 from services.robot_bridge.config import RobotBridgeConfig
 from tests.services.builders import EventClock, SoloService
+from tests.services.robot_bridge.cameras.pictures import SIZE, write_video
 
 
 def config_of(directory, **sections):
@@ -93,3 +94,33 @@ def test_a_task_that_cannot_be_built_is_a_config_error(tmp_path, sections, match
 def test_a_wrong_setting_is_named_with_what_was_expected(tmp_path, settings, match):
     with pytest.raises(ConfigError, match=match):
         config_of(tmp_path, robot_bridge=settings)
+
+
+def test_a_task_sees_through_the_camera_that_is_configured(tmp_path):
+    write_part(tmp_path, 10, {"steps": 1})
+    video = write_video(tmp_path / "video.avi", 5)
+    service = serve_in(
+        tmp_path,
+        task={"name": "noise_frames", "height": SIZE.height, "width": SIZE.width},
+        camera={"name": "recorded", "file": str(video)},
+        robot_bridge={"steps": 1},
+    )
+    assert service.details()["task"] == "noise_frames"
+
+
+@pytest.mark.parametrize(
+    ("sections", "match"),
+    [
+        ({"camera": {"name": "webcam"}}, r"\[camera\] name = 'webcam': expected one of opencv, recorded"),
+        ({"camera": {"name": "recorded"}}, "file is missing"),
+        ({"camera": {"name": "recorded", "file": "nowhere.avi"}}, "there is no such file"),
+        ({"camera": {"name": "opencv", "device": 255}}, "camera 255 does not exist"),
+        ({"cameras": {"mine": "json:JSONDecoder"}, "camera": {"name": "mine"}}, "expected a subclass of Camera"),
+        ({"camera": {"name": "opencv"}, "robot_bridge": {"pacing": "lockstep"}}, "pacing = realtime, got lockstep"),
+        ({"camera": {"name": "opencv"}, "task": {"name": "dot_reacher"}}, "dot_reacher has no camera"),
+        ({"camera": {"name": "opencv"}, "task": {"name": "visual_dot_reacher"}}, "draws its frames itself"),
+    ],
+)
+def test_a_camera_that_cannot_be_used_is_named(tmp_path, sections, match):
+    with pytest.raises((ConfigError, CameraError), match=match):
+        serve_in(tmp_path, **{"task": {"name": "noise_frames"}, **sections})
