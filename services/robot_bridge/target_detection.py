@@ -152,5 +152,5 @@ def mask_warning(mask: Mask) -> str | None:
     if found == 0:
         return "no pixel has one of these colours: widen the range, or is the target not in the picture?"
     if found == mask.size:
-        return "every pixel has one of these colours: narrow the range, or nothing can be told from the target"
+        return "every pixel has one of these colours: narrow the range, the target cannot be told from the rest"
     return None

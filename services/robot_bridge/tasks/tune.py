@@ -65,12 +65,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rows = variations(frame, colours, options.spread, options.columns)
             mask = colour_mask(frame, colours)
             path = options.out / f"{name}.png"
-            print(_table(name, colours, mask, rows))
             warning = mask_warning(mask)
+            _write(path, draw_sheet(frame, f"{name}: {colours.space.channels}  {colours}", mask, rows, warning))
+            print(_table(name, colours, mask, rows))
+            print(f"  {path}\n")
             if warning:
                 print(f"{PROGRAM}: warning: {name}: {warning}", file=sys.stderr)
-            _write(path, draw_sheet(frame, f"{name}: {colours.space.channels}  {colours}", mask, rows, warning))
-            print(f"  {path}\n")
     except RelodError as error:
         print(f"{PROGRAM}: error: {error}", file=sys.stderr)
         return 1

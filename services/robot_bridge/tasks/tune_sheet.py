@@ -19,7 +19,7 @@ GAP = 12
 LABEL_HEIGHT = 24
 _HINT = "Orange: as given. Where a bound is good, the masks beside it look the same."
 _PAPER, _INK, _MARK, _WARNING = (250, 250, 248), (30, 30, 30), (208, 96, 0), (190, 20, 20)
-_INSIDE, _OUTSIDE = (255, 255, 255), (44, 48, 56)
+_INSIDE, _OUTSIDE, _EDGE = (255, 255, 255), (44, 48, 56), (140, 140, 140)
 _FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
 
 
@@ -98,6 +98,7 @@ def _scaled(picture: UInt8Array, size: tuple[int, int]) -> UInt8Array:
 
 def _paste(sheet: UInt8Array, picture: UInt8Array, left: int, top: int) -> None:
     height, width = picture.shape[:2]
+    cv2.rectangle(sheet, (left - 1, top - 1), (left + width, top + height), _EDGE, 1)  # A full mask is white on white.
     sheet[top : top + height, left : left + width] = picture
 
 
