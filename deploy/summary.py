@@ -65,7 +65,7 @@ def summarise(record: Record) -> Summary:
     for service, jumps in run_parts.clock_jumps(parts).items():
         notes.append(f"{service}: its clock and the bridge's jumped against each other ({jumps} x)")
     if stalls := _count(parts.total(ROBOT_BRIDGE, "camera_stalls")):
-        notes.append(f"the camera stalled ({stalls} x): each time, the attempt was truncated")
+        notes.append(f"the camera stalled ({stalls} x); attempts that it befell were truncated")
     values = {
         "task": run.task if run else run_parts.newest_detail(parts, ROBOT_BRIDGE, "task"),
         "algorithm": run.algorithm if run else None,

@@ -204,7 +204,7 @@ def test_a_camera_that_stalled_is_noted(tmp_path: Path) -> None:
     write_part(tmp_path, "robot_bridge", 141, counters={"camera_stalls": 2})
     write_part(tmp_path, "robot_bridge", 142, counters={"camera_stalls": 1})
     notes = summarise(read_record(tmp_path)).values["notes"]
-    assert "the camera stalled (3 x): each time, the attempt was truncated" in notes
+    assert "the camera stalled (3 x); attempts that it befell were truncated" in notes
 
 
 def test_in_simulated_time_an_action_has_no_age(tmp_path: Path) -> None:
