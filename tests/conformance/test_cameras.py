@@ -107,8 +107,6 @@ def test_capture_times_go_by_the_clock_and_never_back(scene):
     frames = collect(scene, scene.open(), 20)
     times = [begun_ns, *(frame.capture_ns for frame in frames), scene.clock.now_ns()]
     assert times == sorted(times)
-    # Pictures come every 10 ms at most, so 20 of them do not come at once.
-    assert times[-2] - times[1] >= 50_000_000
 
 
 def test_who_does_not_look_finds_the_newest_frames_and_the_others_are_counted(scene):

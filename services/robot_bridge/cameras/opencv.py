@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 NO_DEVICE = -1
 _CLOSING_TAKES_S = 2.0
-"""How much longer than a read a thread may take to end."""
+"""How much longer than opening or reading the thread may take to end."""
 
 
 @dataclass(frozen=True)
@@ -102,10 +102,11 @@ class OpenCVCamera(Camera):
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        # Only the thread may release the device: it may be inside a read.
-        self._thread.join(self._settings.read_timeout + _CLOSING_TAKES_S)
+        # Only the thread may release the device: it may be inside a call.
+        longest_s = max(self._settings.open_timeout, self._settings.read_timeout)
+        self._thread.join(longest_s + _CLOSING_TAKES_S)
         if self._thread.is_alive():
-            logger.warning("%s is still being read: it is released when that ends", self._name)
+            logger.warning("%s does not answer: it is released when it does", self._name)
 
     # ------------------------------------------------------------------ the thread
 
@@ -139,8 +140,8 @@ class OpenCVCamera(Camera):
                     if not self._closed:
                         self._clock.wait(self._changed, self._settings.reconnect_after)
             else:
-                self._lost = None
                 logger.warning("%s is back", self._name)
+                self._lost = None
                 return capture
         return cv2.VideoCapture()
 

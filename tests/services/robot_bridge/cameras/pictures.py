@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.server
 import threading
+import time
 
 import cv2
 import numpy as np
@@ -53,7 +54,8 @@ class MjpegServer:
 
     def __init__(self, port=0, size=SIZE) -> None:
         self._size, self._paused, self._ended = size, threading.Event(), threading.Event()
-        self._connections = []
+        self.sent_ns = {}
+        """Number of a picture -> when it was sent, the computer's monotonic clock."""
         self._numbers = iter(range(1, 1 << _BITS))
         camera = self
 
@@ -62,7 +64,6 @@ class MjpegServer:
                 pass
 
             def do_GET(self):
-                camera._connections.append(self.connection)
                 camera._serve(self)
 
         self._server = http.server.ThreadingHTTPServer(("127.0.0.1", port), Handler)
@@ -100,8 +101,10 @@ class MjpegServer:
         while not self._ended.wait(_PERIOD_S):
             if self._paused.is_set():
                 continue
-            picture = cv2.imencode(".jpg", draw(next(self._numbers), self._size))[1].tobytes()
+            number = next(self._numbers)
+            picture = cv2.imencode(".jpg", draw(number, self._size))[1].tobytes()
             head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
+            self.sent_ns[number] = time.monotonic_ns()
             try:
                 request.wfile.write(head.encode() + picture + b"\r\n")
             except OSError:

@@ -11,7 +11,8 @@ from services.robot_bridge.cameras import PictureSize, open_camera
 from tests.helpers import eventually, free_port
 from tests.services.robot_bridge.cameras.pictures import SIZE, MjpegServer, number_of
 
-QUICK = {"open_timeout": 0.5, "read_timeout": 0.3, "reconnect_after": 0.02, "capacity": 1000}
+QUICK = {"read_timeout": 0.3, "reconnect_after": 0.02, "capacity": 1000}
+"""A busy computer may lose the camera more often than a test wants: none relies on that it does not."""
 
 
 @pytest.fixture
@@ -56,7 +57,15 @@ def test_a_stream_that_stalls_is_lost_and_comes_back_with_the_next_numbers(opene
     after = camera.take()
     assert after[0].frame_id == before[-1].frame_id + 1
     assert number_of(after[0].frame) > number_of(before[-1].frame)
-    assert camera.losses == 1
+    assert camera.losses >= 1
+
+
+def test_a_frames_time_is_between_when_it_was_sent_and_when_it_is_taken(opened, server):
+    camera, frames = opened(url=server.url), []
+    eventually(lambda: frames.extend(camera.take()) or len(frames) >= 20, "frame 20")
+    taken_ns = SystemClock().now_ns()
+    for frame in frames:
+        assert server.sent_ns[number_of(frame.frame)] <= frame.capture_ns <= taken_ns
 
 
 def test_a_server_that_is_gone_is_named_and_found_again_when_it_is_back(opened, caplog):
@@ -67,10 +76,10 @@ def test_a_server_that_is_gone_is_named_and_found_again_when_it_is_back(opened, 
     assert f"127.0.0.1:{first.port}" in camera.lost
     second = MjpegServer(first.port)
     comes_back(camera)
-    second.close()
     said = [record.message for record in caplog.records if "127.0.0.1" in record.message]
     assert "is lost: expected a frame within 0.3 s, none came; trying to open it every 0.02 s" in said[0]
-    assert "is back" in said[1]
+    assert said[1].endswith("is back")  # of the attempts between, nothing is said
+    second.close()
 
 
 def test_a_server_that_is_back_with_another_size_says_so_until_it_has_the_right_one(opened):
@@ -106,7 +115,7 @@ def test_closing_ends_a_lost_camera_that_waits_for_its_next_attempt(opened):
 def test_an_address_where_nobody_answers_is_named(opened):
     url = f"http://127.0.0.1:{free_port()}/video"
     with pytest.raises(CameraError, match=rf"camera {url} cannot be reached.*within 0.5 s; is its server running"):
-        opened(url=url)
+        opened(url=url, open_timeout=0.5)
 
 
 def answering(payload):
@@ -127,7 +136,7 @@ def answering(payload):
 def test_an_address_without_a_video_is_named_within_the_timeout(opened, payload):
     listener, kept = answering(payload)
     with pytest.raises(CameraError, match="cannot be reached, or sends no video"):
-        opened(url=f"http://127.0.0.1:{listener.getsockname()[1]}/")
+        opened(url=f"http://127.0.0.1:{listener.getsockname()[1]}/", open_timeout=0.5)
     for connection in kept:
         connection.close()
     listener.close()
