@@ -1,7 +1,7 @@
 """XXH3-128 of a policy's bytes, and whether its numbers are finite, in one pass over memory.
 
 A policy with camera is larger than a processor's own caches: fetching it takes longer than computing with it, and the
-xxhash library and NumPy would each fetch it. LLVM compiles the pass in a tenth of a second; through numba, which finds
+xxhash library and NumPy would each fetch it. LLVM compiles the pass in .2 s; through numba, which finds
 no vectors in loops over eight lanes, it would take a second, and twice the memory. Only :func:`load` imports LLVM.
 
 The digest is that of https://github.com/Cyan4973/xxHash/blob/dev/doc/xxhash_spec.md, "XXH3 Algorithm Description (for
