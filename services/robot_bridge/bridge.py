@@ -106,6 +106,9 @@ class RobotBridge:
     # ------------------------------------------------------------------ attempts
 
     def _run_attempts(self) -> None:
+        if self._realtime:
+            self._task.start(self._clock)
+            self._world_ns = self._clock.now_ns()
         self._task.advance_to(self._world_ns)
         try:
             while not self._over():

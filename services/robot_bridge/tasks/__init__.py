@@ -23,6 +23,8 @@ TASKS = {
     "reacher_extreme_visual": "services.robot_bridge.tasks.reacher:ReacherExtremeVisual",
     "ball_in_cup": "services.robot_bridge.tasks.ball_in_cup:BallInCup",
     "ball_in_cup_visual": "services.robot_bridge.tasks.ball_in_cup:BallInCupVisual",
+    "ur5_visual_reacher": "services.robot_bridge.tasks.ur5_visual_reacher:Ur5VisualReacher",
+    "ur5_visual_reacher_min_time": "services.robot_bridge.tasks.ur5_visual_reacher:Ur5VisualReacherMinTime",
     "noise_frames": "services.robot_bridge.tasks.noise_frames:NoiseFrames",
 }
 """Task id -> ``module:Class``; imported only when chosen, so that a robot's driver burdens no one else."""

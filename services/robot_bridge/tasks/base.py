@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from common.clock import Clock
 from common.errors import ConfigError
 from common.messages import Float32Array, Int64Array, TaskSpec, UInt8Array
 from services.robot_bridge.cameras.base import Camera, PictureSize
@@ -21,7 +22,7 @@ class SensorReading:
     frames: UInt8Array
     """(k, H, W, C): camera frames that are new since the reading before, oldest first."""
     frame_ids: Int64Array
-    """(k,): consecutive over the task's lifetime."""
+    """(k,): consecutive over the task's lifetime; a gap is frames that were lost."""
     frame_capture_ns: Int64Array
     """(k,): capture times on the clock given to :meth:`Task.advance_to`."""
     proprioception: Float32Array
@@ -54,6 +55,12 @@ class Task(ABC):
     @abstractmethod
     def __init__(self, settings: Any, *, name: str, preset: str, pacing: str, rng: np.random.Generator) -> None:
         """Build the world; ``name``, ``preset`` and ``pacing`` go into the TaskSpec, ``rng`` is all randomness."""
+
+    def start(self, clock: Clock) -> None:  # noqa: B027: most worlds need nothing
+        """In real time, once, before all else: a world may go on by ``clock`` in threads of its own from now on.
+
+        In lockstep nobody calls it. What a command or a time means is the same either way.
+        """
 
     @abstractmethod
     def begin_episode(self) -> None:

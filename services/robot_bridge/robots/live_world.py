@@ -1,0 +1,126 @@
+"""A world that goes on by the clock in a thread of its own, whatever the action cycle is doing.
+
+What the cycle wants of it are orders, each with the time at which it was given: the thread lets the world go on until
+then before it obeys. What the world shows lies ready: the newest packet, and frames in the camera's bounded buffer. So
+the cycle takes what is there and never waits for a picture. It waits only where an attempt begins, for the first one.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from common.clock import Clock
+from common.errors import ServiceError
+from services.robot_bridge.robots.sensed_world import SensedWorld, SensorPacket
+
+LONGEST_WAIT_S = 10.0
+"""For the first picture of an attempt; opening OpenGL takes a large part of a second."""
+_Order = Callable[[], None]
+
+
+class LiveWorld:
+    """Drives a :class:`SensedWorld`, which is its thread's alone from now on, and does for others what that does."""
+
+    def __init__(self, world: SensedWorld, clock: Clock) -> None:
+        """Begin to live.
+
+        Raises:
+            ServiceError: there is no picture: nothing can be drawn here.
+        """
+        self._world, self._clock = world, clock
+        self.camera = world.camera
+        # Appended to by the cycle's thread, taken from by the world's: a deque needs no lock for that.
+        self._orders: deque[tuple[int, _Order]] = deque()
+        self._failure: BaseException | None = None
+        self._ended = False
+        self._changed = clock.condition()
+        """Held for an instant only: to wait, to say that there is an order in a hurry, or that it was carried out."""
+        self._hurried = self._placed = 0
+        """Orders in a hurry, given and carried out."""
+        self._thread = clock.thread(self._run, "simulated world")
+        self._thread.start()
+        self._carry_out_at_once(lambda: None)
+
+    @property
+    def newest(self) -> SensorPacket:
+        """The newest packet of the sensors."""
+        return self._world.newest
+
+    def advance_to(self, now_ns: int) -> None:
+        """Tell that the world has ended, if it has; it goes on by itself.
+
+        Raises:
+            ServiceError: what has ended it.
+        """
+        if self._failure is not None:
+            raise ServiceError(f"the simulated world has ended: {self._failure}") from self._failure
+
+    def place(self, goal: np.ndarray, start: np.ndarray, seed: int) -> None:
+        """Place goal and robot, and wait until there is a packet and a frame of it.
+
+        Raises:
+            ServiceError: there is none after :data:`LONGEST_WAIT_S`, or the world has ended.
+        """
+        self._carry_out_at_once(functools.partial(self._world.place, goal, start, seed))
+
+    def command(self, action: np.ndarray) -> None:
+        """Let the robot obey ``action`` (A,) from now on."""
+        self._orders.append((self._clock.now_ns(), functools.partial(self._world.command, np.array(action))))
+
+    def stop(self) -> None:
+        """Let the robot brake and rest."""
+        self._orders.append((self._clock.now_ns(), self._world.stop))
+
+    def close(self) -> None:
+        """End the thread; the world stands still from now on."""
+        self._ended = True
+        with self._changed:
+            self._changed.notify_all()
+        self._thread.join(LONGEST_WAIT_S)
+
+    def _carry_out_at_once(self, order: _Order) -> None:
+        def carry_out() -> None:
+            order()
+            with self._changed:
+                self._placed += 1
+                self._changed.notify_all()
+
+        given_ns = self._clock.now_ns()
+        self._orders.append((given_ns, carry_out))
+        with self._changed:
+            self._hurried += 1
+            self._changed.notify_all()
+            while self._placed < self._hurried and self._failure is None:
+                if not self._clock.wait_until(given_ns + round(LONGEST_WAIT_S * 1e9), self._changed):
+                    break
+        self.advance_to(given_ns)
+        if self._placed < self._hurried:
+            raise ServiceError(f"the simulated world has shown no picture for {LONGEST_WAIT_S:g} s: its thread hangs")
+
+    # ------------------------------------------------------------------ the world's thread
+
+    def _run(self) -> None:
+        try:
+            while not self._ended:
+                self._live_until_now()
+                with self._changed:
+                    if self._placed == self._hurried and not self._ended:
+                        self._clock.wait_until(self._world.next_due_ns, self._changed)
+        except Exception as failure:
+            with self._changed:
+                self._failure = failure
+                self._changed.notify_all()
+        finally:
+            self._world.close()
+
+    def _live_until_now(self) -> None:
+        now_ns = self._clock.now_ns()
+        while self._orders:
+            given_ns, carry_out = self._orders.popleft()
+            self._world.advance_to(given_ns)
+            carry_out()
+        self._world.advance_to(now_ns)
