@@ -161,7 +161,7 @@ def scene_xml(monitor: Monitor, field_of_view: float) -> str:
       <geom type="box" size=".035 .012 {stand / 2 + 0.05}" pos="0 .04 {-1.5 * stand + 0.05}" material="dark"/>
       <geom type="box" size=".12 .08 .006" pos="0 .04 {0.006 - monitor.z}" material="dark"/>
       <geom name="screen" type="box" size="{half_width} .001 {half_height}" pos="0 .0045 0" material="screen"/>
-      <geom name="target" type="cylinder" size="{radius} .0008" euler="{QUARTER} 0 0" pos="0 .0022 0" material="target"/>
+      <geom name="target" type="cylinder" size="{radius} .0008" pos="0 .0022 0" zaxis="0 1 0" material="target"/>
     </body>
     <body name="base" euler="0 0 {math.pi}">
       <geom type="cylinder" size=".078 .004" pos="0 0 .004" material="dark"/>

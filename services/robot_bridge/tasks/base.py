@@ -56,7 +56,7 @@ class Task(ABC):
     def __init__(self, settings: Any, *, name: str, preset: str, pacing: str, rng: np.random.Generator) -> None:
         """Build the world; ``name``, ``preset`` and ``pacing`` go into the TaskSpec, ``rng`` is all randomness."""
 
-    def start(self, clock: Clock) -> None:  # noqa: B027: most worlds need nothing
+    def start(self, clock: Clock) -> None:  # noqa: B027 - most worlds need nothing
         """In real time, once, before all else: a world may go on by ``clock`` in threads of its own from now on.
 
         In lockstep nobody calls it. What a command or a time means is the same either way.
