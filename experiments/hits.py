@@ -14,23 +14,20 @@ from pathlib import Path
 
 from common.record import write_atomically
 from deploy.console import Console
-from deploy.stop_signals import INTERRUPTED, StopSignals
 from experiments.command_line import exit_code
-from experiments.grid import GridRecord, failure_text, run_grid
+from experiments.grid import GridRecord
 from experiments.target_hits.choice import (
-    TaskChoice,
     add_options,
     check_count,
     check_limits,
     choose_task,
     record_settings,
 )
+from experiments.target_hits.counted_grid import count_grid
 from experiments.target_hits.counting import STEPS
 from experiments.target_hits.figure import draw_hits
-from experiments.target_hits.jobs import all_keys, hit_counts, relative_cost, work
+from experiments.target_hits.jobs import all_keys, hit_counts
 from experiments.target_hits.table import cells, csv_text, notes, table_text
-from experiments.wording import counted
-from experiments.workers import WorkerPool
 
 SEEDS = 30
 
@@ -48,40 +45,23 @@ def _count(options: argparse.Namespace, console: Console) -> int:
     steps = check_count("--steps", options.steps)
     workers = check_count("--workers", options.workers)
     choices = [choose_task(name, options.preset, options.set) for name in dict.fromkeys(options.task)]
-    with StopSignals() as stop:
-        settings = record_settings(choices, steps=steps)
-        keys = all_keys((choice.name for choice in choices), limits, seeds)
-        with (
-            GridRecord(Path(options.out), settings) as record,
-            WorkerPool(work, settings, workers) as pool,
-        ):
-            console.line(_beginning(choices, record, len(keys), sum(key in record.rows for key in keys)))
-            failures = run_grid(
-                record,
-                keys,
-                pool,
-                progress=lambda progress: console.status(str(progress)),
-                failed=lambda failure: console.error(failure_text(failure)),
-                asked_to_stop=lambda: stop.asked,
-                cost=relative_cost(settings),
-            )
-            write_results(record, steps, console)
-    if stop.asked:
-        console.line("interrupted: the same command goes on from here")
-        return INTERRUPTED
-    if failures:
-        console.error(
-            f"{len(failures)} of {counted(len(keys), 'job')} failed (tracebacks: "
-            f"{record.directory / 'failures.log'}); the same command tries them again"
-        )
-    return 1 if failures else 0
+    settings = record_settings(choices, steps=steps)
+    return count_grid(
+        Path(options.out),
+        settings,
+        all_keys((choice.name for choice in choices), limits, seeds),
+        tasks=", ".join(f"{choice.name} ({choice.preset})" for choice in choices),
+        workers=workers,
+        console=console,
+        report=lambda record: write_results(record, steps, console),
+    )
 
 
-def write_results(record: GridRecord, steps: int, console: Console) -> None:
-    """Write and show what the record has so far."""
+def write_results(record: GridRecord, steps: int, console: Console) -> int:
+    """Write and show what the record has so far; return the exit code, 0."""
     counts = hit_counts(record.rows)
     if not counts:
-        return
+        return 0
     path = record.directory / "hits.csv"
     write_atomically(path, csv_text(counts))
     summary = cells(counts)
@@ -90,12 +70,7 @@ def write_results(record: GridRecord, steps: int, console: Console) -> None:
     for note in notes(summary, steps):
         console.line(f"\n{note}")
     console.line(f"\n{path}, {record.directory / 'hits.png'}")
-
-
-def _beginning(choices: Sequence[TaskChoice], record: GridRecord, jobs: int, finished: int) -> str:
-    tasks = ", ".join(f"{choice.name} ({choice.preset})" for choice in choices)
-    there = f", {finished} of them in {record.directory} already" if finished else ""
-    return f"{tasks}: {counted(jobs, 'job')}{there}"
+    return 0
 
 
 def _parser() -> argparse.ArgumentParser:
