@@ -7,7 +7,9 @@ import pytest
 from services.robot_bridge.robots.ur5 import Ur5, ur5_limits
 from services.robot_bridge.robots.ur5_scene import TOOL, WRIST_CAMERA, Monitor, Ur5Scene
 
-MONITOR = Monitor(distance=0.78, x=-0.05, z=0.5, width=0.53, height=0.298125, target_radius=7 / 160, target_margin=0.125)
+MONITOR = Monitor(
+    distance=0.78, x=-0.05, z=0.5, width=0.53, height=0.298125, target_radius=7 / 160, target_margin=0.125
+)
 POSTURE = [1.5707, -2.0, 2.1, -3.0415, -1.5707, 3.1415]
 PUBLISHED = [
     # a m, alpha rad, d m: Universal Robots, "DH parameters for calculations of kinematics and dynamics", UR5

@@ -1,0 +1,154 @@
+"""A world in a thread of its own: by a simulated clock the same as in lockstep; by the real one, never waited for."""
+
+import functools
+import threading
+
+import numpy as np
+import pytest
+
+from common.clock import SystemClock
+from common.errors import ServiceError
+from experiments.simulation import SimulatedClock
+from services.robot_bridge.robots import live_world
+from services.robot_bridge.robots.live_world import LiveWorld
+from tests.helpers import TIMEOUT_S
+from tests.services.robot_bridge.robots.toy_world import toy_world
+
+MS = 1_000_000
+ZERO, ONE = np.zeros(1), np.ones(1)
+
+
+@pytest.fixture
+def clock():
+    clock = SimulatedClock()
+    yield clock
+    clock.end()
+
+
+def sleep_until(clock, now_ns):
+    condition = clock.condition()
+    with condition:
+        clock.wait_until(now_ns, condition)
+
+
+def test_a_live_world_shows_what_the_same_world_in_lockstep_shows(clock):
+    live, lockstep = LiveWorld(toy_world(sensor_noise=0.01), clock), toy_world(sensor_noise=0.01)
+    begun_ns = clock.now_ns()
+    lockstep.advance_to(begun_ns)
+    worlds = live, lockstep
+    seen = {world: [] for world in worlds}
+    for cycle in range(1, 60):
+        # Never at the time of a packet or of a frame: which is first would be a matter of the threads' order.
+        now_ns = begun_ns + cycle * 40_300_000
+        sleep_until(clock, now_ns)
+        for world in worlds:
+            world.advance_to(now_ns)
+            frames = [(frame.frame_id, frame.capture_ns, frame.frame.tobytes()) for frame in world.camera.take()]
+            seen[world].append((world.newest.capture_ns, world.newest.values.tolist(), frames))
+            if cycle % 20 == 0:
+                world.place(ZERO, np.array([0.1 * cycle]), cycle)
+            elif cycle % 17 == 0:
+                world.stop()
+            else:
+                world.command(np.sin([cycle]))
+    assert seen[live] == seen[lockstep]
+    assert len({str(shown) for shown in seen[live]}) == 59
+    live.close()
+
+
+def test_the_world_goes_on_while_nobody_looks(clock):
+    world = toy_world()
+    live = LiveWorld(world, clock)
+    live.command(ONE)
+    sleep_until(clock, clock.now_ns() + 1_000 * MS + MS)
+    assert live.newest.values[0] == pytest.approx(1.0)  # 1 m/s for 1 s
+    live.stop()
+    sleep_until(clock, clock.now_ns() + 1_000 * MS)
+    assert live.newest.values[0] == pytest.approx(1.0, abs=0.002)  # it was stopped a millisecond later
+    live.close()
+
+
+def test_a_placement_is_there_with_its_frame_when_it_returns(clock):
+    live = LiveWorld(toy_world(latency_ns=100 * MS), clock)
+    live.command(ONE)
+    sleep_until(clock, clock.now_ns() + 500 * MS)
+    before_ns = clock.now_ns()
+    live.place(ZERO, np.array([0.7]), 1)
+    assert live.newest.values == np.float32(0.7)
+    (frame,) = live.camera.take()
+    assert (frame.frame[0, 0, 0], frame.capture_ns) == (70, before_ns)
+    live.close()
+
+
+def test_a_world_that_cannot_draw_says_so_before_anything_begins(clock):
+    world = toy_world()
+
+    def fail():
+        raise ServiceError("no OpenGL backend works here")
+
+    world.camera.on_capture = fail
+    with pytest.raises(ServiceError, match="the simulated world has ended: no OpenGL backend works here"):
+        LiveWorld(world, clock)
+    assert world.camera.closed == 1
+
+
+def test_whoever_looks_is_told_what_has_ended_the_world(clock):
+    world = toy_world()
+    live = LiveWorld(world, clock)
+    live.advance_to(clock.now_ns())
+    world.robot.offset = np.nan
+    sleep_until(clock, clock.now_ns() + 10 * MS)
+    for look in (lambda: live.advance_to(clock.now_ns()), lambda: live.place(ZERO, ZERO, 0)):
+        with pytest.raises(ServiceError, match=r"has ended: a sensor of Cart gave \[nan\]"):
+            look()
+    live.close()
+    assert world.camera.closed == 1
+
+
+def test_a_closed_world_has_no_thread_and_stands_still():
+    world = toy_world()
+    before = threading.active_count()
+    live = LiveWorld(world, SystemClock())
+    assert threading.active_count() == before + 1
+    live.close()
+    assert threading.active_count() == before
+    assert world.camera.closed == 1
+
+
+def test_nothing_waits_for_a_picture_that_is_being_drawn():
+    world = toy_world()
+    clock = SystemClock()
+    live = LiveWorld(world, clock)
+    drawing, drawn = threading.Event(), threading.Event()
+
+    def draw():
+        drawing.set()
+        assert drawn.wait(TIMEOUT_S)
+
+    world.camera.on_capture = draw
+    try:
+        assert drawing.wait(TIMEOUT_S)  # from here on the world's thread hangs
+        for _ in range(100):
+            live.advance_to(clock.now_ns())
+            live.command(ONE)
+            live.stop()
+            live.camera.take()
+            assert live.newest.values.shape == (1,)
+    finally:
+        drawn.set()
+        live.close()
+
+
+def test_a_world_that_hangs_when_an_attempt_begins_is_named(monkeypatch):
+    world = toy_world()
+    live = LiveWorld(world, SystemClock())
+    drawn = threading.Event()
+    world.camera.on_capture = functools.partial(drawn.wait, TIMEOUT_S)
+    monkeypatch.setattr(live_world, "LONGEST_WAIT_S", 0.05)
+    try:
+        with pytest.raises(ServiceError, match=r"has shown no picture for 0.05 s: its thread hangs"):
+            live.place(ZERO, ZERO, 0)
+    finally:
+        drawn.set()
+        monkeypatch.undo()
+        live.close()
