@@ -53,9 +53,9 @@ class Ur5Settings(RobotSettings):
     """m, of the picture's middle."""
     monitor_width: float = setting(0.53, low=0.1, high=1.2)
     """m; 16:9."""
-    target_radius: float = setting(7 / 160, low=0.005, high=0.15)
+    target_radius: float = setting(7 / 160, low=0.005, high=0.25)
     """As a share of the monitor's width."""
-    target_margin: float = setting(20 / 160, low=0.0, high=0.13)
+    target_margin: float = setting(20 / 160, low=0.0, high=0.25)
     """Least distance of the target from the picture's edges, as a share of its width."""
     field_of_view: float = setting(43.3, low=10.0, high=120.0)
     """Degrees, from the camera's picture's top to its bottom."""

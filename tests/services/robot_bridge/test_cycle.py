@@ -52,6 +52,20 @@ def test_a_cycle_ends_with_the_action_that_answered_its_beginning(tmp_path):
     assert {t.incarnation for t in scene.time_steps} == {BRIDGE}
 
 
+@pytest.mark.parametrize(("pacing", "started"), [("realtime", 1), ("lockstep", 0)])
+def test_in_real_time_the_world_is_started_before_all_else(tmp_path, pacing, started):
+    scene = Scene(tmp_path, answers=0.01, steps=2, task={"pacing": pacing})
+    clocks = []
+
+    def start(clock):
+        assert scene.task.advanced_to_ns == []
+        clocks.append(clock)
+
+    scene.task.start = start
+    scene.run()
+    assert clocks == [scene.clock] * started
+
+
 def test_an_answer_is_applied_the_moment_it_arrives(tmp_path):
     scene = Scene(tmp_path, answers=0.013, steps=2)
     scene.run()

@@ -18,7 +18,10 @@ SCENE = """
     <light directional="true" pos="0 0 3" diffuse=".3 .3 .3"/>
     <camera name="above" pos="0 0 2"/>
     <geom name="wall" type="box" size="2 2 .01" pos="0 0 -.1" material="dull"/>
-    <body><joint type="slide" axis="1 0 0"/><geom name="ball" type="sphere" size=".2" pos=".3 0 0" material="dull"/></body>
+    <body>
+      <joint type="slide" axis="1 0 0"/>
+      <geom name="ball" type="sphere" size=".2" pos=".3 0 0" material="dull"/>
+    </body>
   </worldbody>
 </mujoco>
 """
@@ -56,7 +59,7 @@ def draws(monkeypatch):
 def test_a_frame_is_rgb_of_the_size_that_was_asked_for():
     frame = Scene().shot()
     assert (frame.shape, frame.dtype) == ((24, 32, 3), np.uint8)
-    assert frame[12, 16, 0] != frame[0, 0, 0]  # the ball's edge, the wall
+    assert len(np.unique(frame)) > 3  # the wall, and a ball that is darker towards its edge
 
 
 def test_a_scene_in_which_nothing_has_moved_is_not_drawn_again(draws):

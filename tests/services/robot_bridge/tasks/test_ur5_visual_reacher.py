@@ -37,6 +37,11 @@ def arm_of(task):
     return task._world.robot.arm
 
 
+def plain(reading):
+    """All that a reading holds, to the last bit."""
+    return [(part.shape, part.tobytes()) for part in vars(reading).values()]
+
+
 def show_target(task, across, up):
     """Begin an attempt with the target at a place on the monitor, m from its middle."""
     task._goal = np.array([across, up])
@@ -69,8 +74,11 @@ def test_the_tasks_are_those_of_the_thesis(name, speed, limit, reset, has_goal):
         ({"posture": [math.nan] * 6}, "posture = .*: expected 6 finite numbers"),
         ({"box_low": [0.0, 0.0]}, "box_low = .*: expected 3 finite numbers"),
         ({"box_low": [0.2, 0.2, 0.4]}, r"box_low = .*: expected less than box_high = .* in each axis"),
-        ({"target_radius": 0.15, "target_margin": 0.13 + 2e-3}, "target_margin = 0.132: expected"),
-        ({"target_radius": 0.15, "target_margin": 0.13, "monitor_distance": 0.5}, "monitor_distance = 0.5: expected"),
+        (
+            {"target_radius": 0.2, "target_margin": 0.1},
+            "target_radius = 0.2, target_margin = 0.1: expected at most 0.28",
+        ),
+        ({"monitor_distance": 0.5}, "monitor_distance = 0.5: expected"),
         ({"max_speed": 0.0}, "max_speed = 0.0: expected"),
         ({"camera_latency": -0.1}, "camera_latency = -0.1: expected"),
     ],
@@ -126,7 +134,6 @@ def test_the_target_is_red_on_white_and_seen_where_it_is():
         # A disc of 2.32 cm radius, 44 cm away, in 90 pixels over 43.3 degrees: 113 pixels per radian-tangent.
         assert 90 < mask.sum() < 180
         assert np.ptp(rows) == pytest.approx(np.ptp(columns), abs=3)
-        assert (frame[~mask].astype(int).min(axis=0) >= 0).all()
     centre = {
         name: np.argwhere(target_mask(frame)).mean(axis=0)
         for name, frame in (("middle", middle), ("right", right), ("up", up))
@@ -285,7 +292,7 @@ def test_in_simulated_real_time_the_task_is_the_same_as_in_lockstep():
     for task in (live, lockstep):
         task.advance_to(begun_ns)
         task.begin_episode()
-        shown[task] = [task.read()]
+        shown[task] = [plain(task.read())]
     for cycle in range(1, 31):
         # Never at the time of a packet or of a frame.
         now_ns = begun_ns + cycle * 40_300_000
@@ -294,13 +301,12 @@ def test_in_simulated_real_time_the_task_is_the_same_as_in_lockstep():
         action = rng.uniform(live.spec.action_low, live.spec.action_high).astype(np.float32)
         for task in (live, lockstep):
             task.advance_to(now_ns)
-            shown[task].append((task.outcome(), task.read()))
+            shown[task] += [task.outcome(), plain(task.read())]
             task.command(action)
             if cycle == 20:
                 task.begin_attempt()
-                shown[task].append(task.read())
-    assert str(shown[live]) == str(shown[lockstep])
-    assert [r.frame_ids.tolist() for _, r in shown[live][1:5]] == [[1], [2], [3], [4]]
+                shown[task].append(plain(task.read()))
+    assert shown[live] == shown[lockstep]
     live.close()
     lockstep.close()
     clock.end()
