@@ -432,13 +432,13 @@ def test_any_thread_may_use_an_environment(identifier):
     with ThreadPoolExecutor(1) as threads:
         for call in (
             lambda made: made.reset(seed=3),
-            lambda made: made.step(np.ones(2)),
+            lambda made: made.step(np.ones(made.action_space.shape)),
             lambda made: made.reset(seed=4),
         ):
             here, there = call(one), threads.submit(call, other).result(TIMEOUT_S)
             for mine, theirs in zip(frames_and_more(here[0]), frames_and_more(there[0]), strict=True):
                 np.testing.assert_array_equal(mine, theirs)
-    one.step(np.ones(2))
-    other.step(np.ones(2))  # in this thread, and the other one has ended
+    one.step(np.ones(one.action_space.shape))
+    other.step(np.ones(other.action_space.shape))  # in this thread, and the other one has ended
     one.close()
     other.close()
