@@ -431,6 +431,7 @@ class RobotBridge:
             "given_up": self._time_steps.journal.given_up,
             "stops": self._watchdog.stops,
             "camera_stalls": self._camera_watch.stalls,
+            **self._task.counters(),
             **({} if self._last_return is None else {"last_return": self._last_return}),
         }
 

@@ -95,6 +95,11 @@ class SimulatedCamera(Camera):
             self._ready.append(self._under_way.popleft()[1])
 
     @property
+    def frames(self) -> int:
+        """Frames, ever; those that were missed count."""
+        return self._next_id
+
+    @property
     def release_ns(self) -> int | None:
         """When the next frame can be taken; None if no frame is under way."""
         return self._under_way[0][0] if self._under_way else None

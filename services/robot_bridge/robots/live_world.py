@@ -50,6 +50,11 @@ class LiveWorld:
         """The newest packet of the sensors."""
         return self._world.newest
 
+    @property
+    def packets(self) -> int:
+        """Packets of the sensors, ever."""
+        return self._world.packets
+
     def advance_to(self, now_ns: int) -> None:
         """Tell that the world has ended, if it has; it goes on by itself.
 

@@ -64,6 +64,8 @@ class SensedWorld:
         self._begun_ns = 0
         self._packets = self._frames = 0
         """Packets and frames since then that were due, the first ones included."""
+        self.packets = 0
+        """Packets of the sensors, ever."""
         self._newest: SensorPacket | None = None
 
     @property
@@ -153,6 +155,7 @@ class SensedWorld:
             values = values + self._sensor_noise * self._rng.standard_normal(values.shape)
         self._newest = SensorPacket(values.astype(np.float32), now_ns)
         self._packets += 1
+        self.packets += 1
 
     def _capture(self, due_ns: int, now_ns: int) -> None:
         self._frames += 1

@@ -107,6 +107,10 @@ class Task(ABC):
         """
         return None
 
+    def counters(self) -> dict[str, float]:
+        """Counts of the task's own, for the bridge's status and the record; they may be asked for by any thread."""
+        return {}
+
     def close(self) -> None:
         """Let go of the robot."""
         self.stop()

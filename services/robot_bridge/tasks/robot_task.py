@@ -168,6 +168,10 @@ class RobotTask(Task):
         assert self._newest_frame is not None, "advance_to() has not been called"
         return self._judge(self._newest_frame.frame, self._world.newest.values)
 
+    def counters(self) -> dict[str, float]:
+        """How many packets the sensors have sent, and frames the camera has captured: their rates, over time."""
+        return {"sensor_packets": self._world.packets, "camera_frames": self._world.camera.frames}
+
     def close(self) -> None:
         super().close()
         self._world.close()

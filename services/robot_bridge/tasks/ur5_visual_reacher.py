@@ -121,7 +121,14 @@ class _Ur5Task(RobotTask):
         self._target_range = settings.monitor().target_range()
         scene = Ur5Scene(settings.monitor(), settings.field_of_view)
         limits = ur5_limits(settings.acceleration, np.array(settings.box_low), np.array(settings.box_high))
-        return Ur5(scene, limits)
+        robot = Ur5(scene, limits)
+        robot.arm.place(self._draw_start())
+        if not robot.arm.tool_in_box:
+            raise ConfigError(
+                f"posture = {settings.posture}: it holds the tool at {robot.arm.tool_position.round(3).tolist()}, "
+                f"expected a place between box_low = {settings.box_low} and box_high = {settings.box_high}"
+            )
+        return robot
 
     def _draw_goal(self) -> np.ndarray:
         """Draw where on the monitor the target is shown."""

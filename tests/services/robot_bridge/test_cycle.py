@@ -66,6 +66,14 @@ def test_in_real_time_the_world_is_started_before_all_else(tmp_path, pacing, sta
     assert clocks == [scene.clock] * started
 
 
+def test_what_the_task_counts_is_told_with_the_bridges_counts(tmp_path):
+    scene = Scene(tmp_path, answers=0.01, steps=2)
+    scene.task.counters = lambda: {"sensor_packets": 10}
+    scene.run()
+    told = scene.bridge.counters()
+    assert (told["sensor_packets"], told["steps"]) == (10, 2)
+
+
 def test_an_answer_is_applied_the_moment_it_arrives(tmp_path):
     scene = Scene(tmp_path, answers=0.013, steps=2)
     scene.run()

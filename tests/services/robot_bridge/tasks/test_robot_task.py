@@ -199,6 +199,17 @@ def test_commands_are_clipped_and_what_is_no_number_stops_the_robot():
     assert task.cart.speed == 0
 
 
+def test_packets_and_frames_are_counted_over_attempts():
+    task = begun()
+    before = task.counters()
+    task.advance_to(1_000_000_000)
+    task.begin_attempt()
+    task.advance_to(2_000_000_000)
+    after = task.counters()
+    # 125 and 30 a second, and one of each at the placement.
+    assert {name: after[name] - before[name] for name in after} == {"sensor_packets": 251, "camera_frames": 61}
+
+
 def test_closing_stops_the_robot_and_lets_go_of_the_camera():
     task = begun()
     task.command(np.array([0.5], np.float32))

@@ -79,6 +79,7 @@ def test_the_tasks_are_those_of_the_thesis(name, speed, limit, reset, has_goal):
             "target_radius = 0.2, target_margin = 0.1: expected at most 0.28",
         ),
         ({"monitor_distance": 0.5}, "monitor_distance = 0.5: expected"),
+        ({"posture": [0.0] * 6}, r"posture = .* holds the tool at \[0.817, 0.191, -0.005\], expected a place between"),
         ({"max_speed": 0.0}, "max_speed = 0.0: expected"),
         ({"camera_latency": -0.1}, "camera_latency = -0.1: expected"),
     ],
