@@ -15,7 +15,7 @@ class NotMinimumTimeError(RelodError):
 
 
 class World:
-    """Drives a task by one action cycle a step. The sensors are never read: no image is ever rendered."""
+    """Drives a task by one action cycle a step. The sensors are never read: only what judges by images renders any."""
 
     def __init__(self, task: Task) -> None:
         self.spec = task.spec

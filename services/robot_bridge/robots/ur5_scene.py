@@ -147,7 +147,7 @@ def scene_xml(monitor: Monitor, field_of_view: float) -> str:
   </asset>
   <worldbody>
     <light directional="true" pos="1 -1 3" dir="-.35 .45 -1" diffuse=".42 .42 .40" specular=".2 .2 .2"/>
-    <camera name="{ROOM_CAMERA}" pos="1.55 -.75 1.15" xyaxes=".58 .815 0 -.36 .256 .90" fovy="42"/>
+    <camera name="{ROOM_CAMERA}" pos="1.75 -.95 1.2" xyaxes=".638 .770 0 -.305 .253 .918" fovy="40"/>
     <geom name="floor" type="plane" size="4 4 .1" pos="0 0 -.74" material="floor"/>
     <geom name="wall" type="box" size="4 .02 1.6" pos="0 {monitor.distance + 0.62} .86" material="wall"/>
     <geom name="side wall" type="box" size=".02 4 1.6" pos="-2.2 0 .86" material="wall"/>
