@@ -99,6 +99,8 @@ class DenseSettings(Ur5Settings):
 
     time_limit: int = setting(100, low=1)
     """Action cycles: 4 s."""
+    reset_steps: int = setting(0, low=0)
+    """Action cycles that a reset takes: the thesis counts them in minimum-time tasks only."""
     max_speed: float = setting(0.7, low=0.01, high=3.14)
     """rad/s, the bound of the actions."""
     target_weight: float = setting(800.0, low=0.0)

@@ -53,7 +53,7 @@ def show_target(task, across, up):
 
 
 @pytest.mark.parametrize(
-    ("name", "speed", "limit", "reset", "has_goal"), [(MIN_TIME, 2.0, 150, 70, True), (NAMES[0], 0.7, 100, 70, False)]
+    ("name", "speed", "limit", "reset", "has_goal"), [(MIN_TIME, 2.0, 150, 70, True), (NAMES[0], 0.7, 100, 0, False)]
 )
 def test_the_tasks_are_those_of_the_thesis(name, speed, limit, reset, has_goal):
     spec = build(name).spec
