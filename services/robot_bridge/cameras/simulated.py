@@ -34,8 +34,8 @@ class CameraDefects:
 class SimulatedCamera(Camera):
     """Draws what one of a model's cameras sees when it is told to.
 
-    Whoever drives the world captures, perhaps in a thread of its own; one other thread may take. Neither waits for the
-    other.
+    It belongs to a simulated robot: no configuration names it. Whoever drives the world captures, perhaps in a thread
+    of its own; one other thread may take. Neither waits for the other.
     """
 
     def __init__(
@@ -55,6 +55,8 @@ class SimulatedCamera(Camera):
         self._shown: tuple[bytes, UInt8Array] | None = None
         """The scene drawn last, and its picture without noise."""
         self._next_id = 0
+        self._newest_capture_ns = 0
+        self._dropped = 0
         self._under_way: deque[tuple[int, CameraFrame]] = deque()
         """Captured frames that cannot be taken yet, each with the time from which it can."""
         # One side appends, the other one pops: a deque needs no lock for that.
@@ -80,18 +82,23 @@ class SimulatedCamera(Camera):
             capture_ns: now.
             at_once: the frame can be taken now, whatever the latency: someone has waited for it.
         """
-        frame = CameraFrame(self._picture(data, capture_ns), self._next_id, capture_ns)
+        picture = self._picture(data, capture_ns)
+        picture.flags.writeable = False
+        frame = CameraFrame(picture, self._next_id, capture_ns)
         self._next_id += 1
+        self._newest_capture_ns = capture_ns
         self._under_way.append((capture_ns if at_once else capture_ns + self._defects.latency_ns, frame))
         self.release(capture_ns)
 
     def miss(self, frames: int) -> None:
         """Lose ``frames``: nobody could take them any more, so they are not drawn."""
         self._next_id += frames
+        self._dropped += frames
 
     def release(self, now_ns: int) -> None:
         """Hand over what is ready by ``now_ns``."""
         while self._under_way and self._under_way[0][0] <= now_ns:
+            self._dropped += len(self._ready) == BUFFERED_FRAMES
             self._ready.append(self._under_way.popleft()[1])
 
     @property
@@ -110,6 +117,23 @@ class SimulatedCamera(Camera):
             drawing.close()
 
     # ------------------------------------------------------------------ whoever looks
+
+    @property
+    def newest_capture_ns(self) -> int:
+        return self._newest_capture_ns
+
+    @property
+    def dropped(self) -> int:
+        return self._dropped
+
+    @property
+    def lost(self) -> str | None:
+        """None: what does not exist cannot be unplugged."""
+        return None
+
+    @property
+    def losses(self) -> int:
+        return 0
 
     def take(self) -> list[CameraFrame]:
         taken = []

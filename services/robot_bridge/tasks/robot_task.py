@@ -168,6 +168,9 @@ class RobotTask(Task):
         assert self._newest_frame is not None, "advance_to() has not been called"
         return self._judge(self._newest_frame.frame, self._world.newest.values)
 
+    def newest_frame_ns(self) -> int:
+        return self._world.camera.newest_capture_ns
+
     def counters(self) -> dict[str, float]:
         """How many packets the sensors have sent, and frames the camera has captured: their rates, over time."""
         return {"sensor_packets": self._world.packets, "camera_frames": self._world.camera.frames}

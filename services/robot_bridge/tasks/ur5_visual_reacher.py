@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-import cv2
 import numpy as np
 
 from common.config import setting
@@ -22,11 +21,18 @@ from services.robot_bridge.robots.base import SimulatedRobot
 from services.robot_bridge.robots.sensed_world import Rates
 from services.robot_bridge.robots.ur5 import ANGLE_HIGH, ANGLE_LOW, COMMANDED_JOINTS, CONTROL_PERIOD_NS, Ur5, ur5_limits
 from services.robot_bridge.robots.ur5_scene import JOINTS, WRIST_CAMERA, Monitor, Ur5Scene
+from services.robot_bridge.target_detection import (
+    TARGET_COLOURS,
+    Mask,
+    centre_weights,
+    colour_mask,
+    share,
+    weighted_share,
+)
 from services.robot_bridge.tasks.base import Outcome
 from services.robot_bridge.tasks.robot_task import DISTURBED, RobotSettings, RobotTask, View
 
-TARGET_RGB = (120, 0, 0), (255, 50, 50)
-"""Lowest and highest red, green and blue of the target's colour."""
+TARGET = TARGET_COLOURS["ur5"]
 ANGLE_MARGIN = 0.35
 """rad, by which a joint is expected to overshoot its limits while it brakes."""
 
@@ -157,7 +163,7 @@ class Ur5VisualReacherMinTime(_Ur5Task):
     _settings: MinTimeSettings
 
     def _judge(self, frame: UInt8Array, proprioception: Float32Array) -> Outcome:
-        return Outcome(reward=-1.0, terminated=bool(target_mask(frame).mean() > self._settings.threshold))
+        return Outcome(reward=-1.0, terminated=share(colour_mask(frame, TARGET)) > self._settings.threshold)
 
 
 class Ur5VisualReacher(_Ur5Task):
@@ -166,38 +172,29 @@ class Ur5VisualReacher(_Ur5Task):
     SETTINGS = DenseSettings
     HAS_GOAL = False
     _settings: DenseSettings
+    _weights = centre_weights(_Ur5Task.VIEW.height, _Ur5Task.VIEW.width)
 
     def _judge(self, frame: UInt8Array, proprioception: Float32Array) -> Outcome:
         angles = proprioception[:COMMANDED_JOINTS].astype(np.float64)
-        centred = dense_reward(target_mask(frame), angles, self._settings.target_weight, self._settings.posture_weight)
-        return Outcome(reward=centred, terminated=False)
+        settings, mask = self._settings, colour_mask(frame, TARGET)
+        reward = dense_reward(mask, self._weights, angles, settings.target_weight, settings.posture_weight)
+        return Outcome(reward=reward, terminated=False)
 
 
-def target_mask(frame: UInt8Array) -> np.ndarray:
-    """Return where a frame (H, W, 3) RGB shows the target's colour, (H, W) bool."""
-    return cv2.inRange(frame, *TARGET_RGB) != 0
-
-
-def dense_reward(mask: np.ndarray, angles: np.ndarray, target_weight: float, posture_weight: float) -> float:
+def dense_reward(
+    mask: Mask, weights: Float32Array, angles: np.ndarray, target_weight: float, posture_weight: float
+) -> float:
     """Return alpha mean(M o W) - beta (\\|pi - sum of w_1 to w_3\\| + \\|sum of w_4 and w_5\\|), thesis 4.3.1.
 
     Args:
         mask: M (H, W), True where the target is seen.
+        weights: W (H, W), in [0, 1].
         angles: w (5,), rad.
         target_weight: alpha.
         posture_weight: beta.
     """
-    height, width = mask.shape
-    # W is separable: so is the sum, without ever building it.
-    seen = centre_weights(height) @ mask.astype(np.float64) @ centre_weights(width) / mask.size
     twisted = abs(math.pi - float(angles[:3].sum())) + abs(float(angles[3:].sum()))
-    return target_weight * float(seen) - posture_weight * twisted
-
-
-def centre_weights(size: int) -> np.ndarray:
-    """Return (size,) weights, linear from 1 in the middle to 0 just outside of the image; W is their outer product."""
-    places = np.arange(size) - (size - 1) / 2
-    return 1.0 - np.abs(places) / ((size + 1) / 2)
+    return target_weight * weighted_share(mask, weights) - posture_weight * twisted
 
 
 def _expect_numbers(name: str, values: Sequence[float], count: int) -> None:

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from services.robot_bridge.cameras.simulated import LIGHT_PERIOD_NS, CameraDefects, SimulatedCamera
+from services.robot_bridge.cameras.simulated import BUFFERED_FRAMES, LIGHT_PERIOD_NS, CameraDefects, SimulatedCamera
 from tests.services.robot_bridge.opengl import skip_without_opengl
 
 SCENE = """
@@ -124,6 +124,22 @@ def test_a_camera_that_never_captured_is_closed_without_opengl(monkeypatch):
     camera = SimulatedCamera(model, "above", height=24, width=32)
     assert camera.take() == []
     camera.close()
+
+
+def test_what_nobody_took_is_dropped_and_counted():
+    scene = Scene()
+    for k in range(BUFFERED_FRAMES + 3):
+        scene.camera.capture(scene.data, k)
+    scene.camera.miss(2)
+    assert scene.camera.dropped == 3 + 2
+    assert scene.camera.newest_capture_ns == BUFFERED_FRAMES + 2
+    assert (scene.camera.lost, scene.camera.losses) == (None, 0)
+    assert [frame.capture_ns for frame in scene.camera.take()] == list(range(3, BUFFERED_FRAMES + 3))
+
+
+def test_nobody_writes_into_a_frame():
+    with pytest.raises(ValueError, match="read-only"):
+        Scene().shot()[0, 0, 0] = 1
 
 
 def test_a_closed_camera_can_be_closed_again():

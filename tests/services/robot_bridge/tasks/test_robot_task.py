@@ -199,6 +199,14 @@ def test_commands_are_clipped_and_what_is_no_number_stops_the_robot():
     assert task.cart.speed == 0
 
 
+def test_the_age_of_the_newest_frame_does_not_depend_on_who_reads():
+    task = begun(camera_latency=0.1)
+    for cycle in range(1, 10):
+        task.advance_to(cycle * CYCLE_NS)
+        # Captured, even if it cannot be taken yet: at the last multiple of 33.3 ms.
+        assert 0 <= cycle * CYCLE_NS - task.newest_frame_ns() < 33_333_334
+
+
 def test_packets_and_frames_are_counted_over_attempts():
     task = begun()
     before = task.counters()

@@ -7,8 +7,9 @@ import pytest
 
 from common.errors import ConfigError, ServiceError
 from experiments.simulation import SimulatedClock
+from services.robot_bridge.target_detection import centre_weights, colour_mask
 from services.robot_bridge.tasks import load_task
-from services.robot_bridge.tasks.ur5_visual_reacher import centre_weights, dense_reward, target_mask
+from services.robot_bridge.tasks.ur5_visual_reacher import TARGET, dense_reward
 from tests.services.robot_bridge.opengl import skip_without_opengl
 
 CYCLE_NS = 40_000_000
@@ -40,6 +41,11 @@ def arm_of(task):
 def plain(reading):
     """All that a reading holds, to the last bit."""
     return [(part.shape, part.tobytes()) for part in vars(reading).values()]
+
+
+def target_mask(frame):
+    """Where a frame shows the target, (H, W) bool."""
+    return colour_mask(frame, TARGET)
 
 
 def show_target(task, across, up):
@@ -204,22 +210,12 @@ def test_the_arm_reaches_the_goal_when_it_is_driven_there():
 # ---------------------------------------------------------------------- dense reward
 
 
-def test_the_weights_fall_from_the_middle_to_the_edges():
-    np.testing.assert_allclose(centre_weights(3), [0.5, 1.0, 0.5])
-    np.testing.assert_allclose(centre_weights(4), [0.4, 0.8, 0.8, 0.4])
-    for size in (90, 160):
-        weights = centre_weights(size)
-        assert 0 < weights.min() < 0.03
-        assert 0.97 < weights.max() <= 1
-        np.testing.assert_allclose(weights, weights[::-1])
-
-
 def test_the_dense_reward_of_an_image_and_a_posture_computed_by_hand():
     mask = np.array([[False, True, False, False], [False, True, True, False], [False, False, False, True]])
-    # W: rows .5 1 .5, columns .4 .8 .8 .4. Seen: .5*.8 + 1*.8 + 1*.8 + .5*.4 = 2.2, of 12 pixels.
+    # W: rows 1/3 1 1/3, columns .25 .75 .75 .25. Seen: .75/3 + .75 + .75 + .25/3 = 11/6, of 12 pixels.
     # Posture: |pi - (1 - 2 + 3)| + |-1 - .5| = 1.1415926... + 1.5.
-    reward = dense_reward(mask, np.array([1.0, -2.0, 3.0, -1.0, -0.5]), 800.0, 2.0)
-    assert reward == pytest.approx(800 * 2.2 / 12 - 2 * (math.pi - 2 + 1.5))
+    reward = dense_reward(mask, centre_weights(3, 4), np.array([1.0, -2.0, 3.0, -1.0, -0.5]), 800.0, 2.0)
+    assert reward == pytest.approx(800 * 11 / 72 - 2 * (math.pi - 2 + 1.5), rel=1e-6)
 
 
 def test_without_a_target_only_the_posture_counts():
