@@ -7,6 +7,7 @@ import hashlib
 import inspect
 import itertools
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
@@ -28,6 +29,7 @@ PREFERRED_PRESET = "thesis"
 
 _FIRST_LOOK_STEPS = 100
 _SECTION = "task"
+_ROBOTS_SIDE = "services.robot_bridge."
 _DECIDES_WORLDS = ("numpy", "mujoco", "dm-control")
 """Packages whose next version may draw or simulate differently."""
 
@@ -137,9 +139,25 @@ def _version(package: str) -> str:
 
 def _source_digest(task_class: type[Task]) -> str:
     """Of the files that define a task: counts of an edited task must not be mixed with those before."""
-    files = {inspect.getsourcefile(cls) for cls in task_class.__mro__ if issubclass(cls, Task)}
-    contents = [Path(file).read_bytes() for file in sorted(filter(None, files))]
+    contents = [Path(file).read_bytes() for file in source_files(task_class)]
     return hashlib.blake2b(b"".join(contents), digest_size=8).hexdigest()
+
+
+def source_files(task_class: type[Task]) -> list[str]:
+    """The files that define a task: its own, and what they take from the robots' side of this project."""
+    own = {cls.__module__ for cls in task_class.__mro__ if issubclass(cls, Task)}
+    found: set[str] = set()
+    pending = list(own)
+    while pending:
+        name = pending.pop()
+        if name in found:
+            continue
+        found.add(name)
+        named = vars(sys.modules[name]).values()
+        origins = {value.__name__ if inspect.ismodule(value) else getattr(value, "__module__", None) for value in named}
+        pending += [origin for origin in origins if str(origin).startswith(_ROBOTS_SIDE) and origin in sys.modules]
+    files = (inspect.getsourcefile(sys.modules[name]) for name in sorted(found))
+    return [file for file in files if file]
 
 
 def choice_from(settings: Mapping[str, Any], task: str) -> TaskChoice:

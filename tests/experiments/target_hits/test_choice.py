@@ -1,12 +1,13 @@
 """Which task is looked at, and what is refused before any work."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from common.errors import ConfigError
-from experiments.target_hits.choice import check_limits, choice_from, choose_task, record_settings
+from experiments.target_hits.choice import check_limits, choice_from, choose_task, record_settings, source_files
 from tests.experiments.target_hits.fake_tasks import MODULE
 
 
@@ -52,3 +53,18 @@ def test_limits_are_taken_once_each_in_order():
     assert check_limits([50, 10, 50]) == (10, 50)
     with pytest.raises(ConfigError, match="--limits 0: expected at least 1 step"):
         check_limits([10, 0])
+
+
+def test_a_robots_task_is_defined_by_its_scene_its_robot_and_its_camera_too():
+    task = choose_task("ur5_visual_reacher_min_time").build(np.random.default_rng(0))
+    names = {Path(file).name for file in source_files(type(task))}
+    assert {"ur5_visual_reacher.py", "robot_task.py", "ur5.py", "ur5_scene.py", "velocity_arm.py"} <= names
+    assert {"sensed_world.py", "simulated.py", "rendering.py", "target_detection.py"} <= names
+    assert not {"bridge.py", "dot_reacher.py", "numeric.py"} & names
+
+
+def test_a_task_from_elsewhere_is_defined_by_its_own_file():
+    line = choose_task(f"line={MODULE}:Line").build(np.random.default_rng(0))
+    names = [Path(file).name for file in source_files(type(line))]
+    assert "fake_tasks.py" in names
+    assert not {"ur5.py", "dot_reacher.py"} & set(names)
