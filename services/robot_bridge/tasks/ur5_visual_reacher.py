@@ -184,7 +184,7 @@ class Ur5VisualReacher(_Ur5Task):
 def dense_reward(
     mask: Mask, weights: Float32Array, angles: np.ndarray, target_weight: float, posture_weight: float
 ) -> float:
-    """Return alpha mean(M o W) - beta (\\|pi - sum of w_1 to w_3\\| + \\|sum of w_4 and w_5\\|), thesis 4.3.1.
+    """Return alpha mean(M o W) - beta (abs(pi - w_1 - w_2 - w_3) + abs(w_4 + w_5)), thesis 4.3.1.
 
     Args:
         mask: M (H, W), True where the target is seen.
