@@ -67,6 +67,15 @@ class SimulatedCamera(Camera):
 
     # ------------------------------------------------------------------ whoever drives the world
 
+    def open(self) -> None:
+        """Load OpenGL, which takes a large part of a second the first time; else the first frame does.
+
+        Raises:
+            ServiceError: nothing can be drawn here.
+        """
+        if self._drawing is None:
+            self._drawing = OffscreenCamera(self._model, self._window, self._name)
+
     def begin(self, rng: np.random.Generator) -> None:
         """Forget all frames; noise and light follow from ``rng`` from now on."""
         self._under_way.clear()
@@ -147,8 +156,8 @@ class SimulatedCamera(Camera):
     # ------------------------------------------------------------------ the picture
 
     def _picture(self, data: mujoco.MjData, capture_ns: int) -> UInt8Array:
-        if self._drawing is None:  # Not before: a world that nobody looks at needs no OpenGL.
-            self._drawing = OffscreenCamera(self._model, self._window, self._name)
+        self.open()  # Not before: a world that nobody looks at needs no OpenGL.
+        assert self._drawing is not None
         mujoco.mj_camlight(self._model, data)
         brightness = self._set_lights(capture_ns)
         scene = b"".join(

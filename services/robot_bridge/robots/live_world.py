@@ -110,6 +110,8 @@ class LiveWorld:
 
     def _run(self) -> None:
         try:
+            self._world.camera.open()
+            self._world.advance_to(self._clock.now_ns())  # Time begins when the camera can see it.
             while not self._ended:
                 self._live_until_now()
                 with self._changed:

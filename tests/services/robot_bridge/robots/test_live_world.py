@@ -80,6 +80,16 @@ def test_a_placement_is_there_with_its_frame_when_it_returns(clock):
     live.close()
 
 
+def test_time_begins_when_the_camera_is_open(clock):
+    world = toy_world()
+    begun_ns = clock.now_ns()
+    world.camera.on_open = lambda: sleep_until(clock, begun_ns + 700 * MS)
+    live = LiveWorld(world, clock)
+    assert [frame.capture_ns for frame in live.camera.take()] == [begun_ns + 700 * MS]
+    assert live.newest.capture_ns == begun_ns + 700 * MS
+    live.close()
+
+
 def test_a_world_that_cannot_draw_says_so_before_anything_begins(clock):
     world = toy_world()
 

@@ -60,7 +60,12 @@ class Sketch(SimulatedCamera):
         super().__init__(model, "eye", height=2, width=3, defects=CameraDefects(**defects))
         self.on_capture = lambda: None
         """What happens while a frame is drawn."""
+        self.on_open = lambda: None
+        """What happens while it is opened."""
         self.closed = 0
+
+    def open(self) -> None:
+        self.on_open()
 
     def close(self) -> None:
         self.closed += 1
