@@ -163,7 +163,8 @@ class Ur5VisualReacherMinTime(_Ur5Task):
     _settings: MinTimeSettings
 
     def _judge(self, frame: UInt8Array, proprioception: Float32Array) -> Outcome:
-        return Outcome(reward=-1.0, terminated=share(colour_mask(frame, TARGET)) > self._settings.threshold)
+        seen = share(colour_mask(frame, TARGET))
+        return Outcome(reward=-1.0, terminated=bool(seen > self._settings.threshold))
 
 
 class Ur5VisualReacher(_Ur5Task):
