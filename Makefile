@@ -48,7 +48,7 @@ soak: environment ## run for 21 minutes; fail if memory or open files grow
 study-min-time: environment ## learn under several time limits; resumable; SIZE=small (within an hour) or thesis
 	$(python) -m experiments.minimum_time --size $(SIZE)
 
-study-modes: environment ## learn in several modes, in virtual time; resumable; SIZE=glance, small (two hours), thesis, or real (in real time)
+study-modes: environment ## learn in several modes, in virtual time; resumable; SIZE=glance, small or ppo (two hours each), thesis, or real (in real time)
 	$(python) -m experiments.distribution --size $(SIZE)
 
 format: environment ## format the code and fix what the linter can

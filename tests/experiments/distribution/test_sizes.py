@@ -9,7 +9,7 @@ from common.topics import ACTOR, LEARNER, REPLAY
 from deploy.hosts import load_host
 from experiments.distribution.configurations import PPO, QUESTIONS, SAC, SAC_PENDING
 from experiments.distribution.jobs import training_of
-from experiments.distribution.sizes import SIZES, SMALL, THESIS
+from experiments.distribution.sizes import PPO_ONLY, SIZES, SMALL, THESIS
 from experiments.training import plan_training
 
 CONFIGURATIONS = {
@@ -41,7 +41,8 @@ def test_the_actor_of_remote_local_is_as_slow_as_the_laptop_s():
 
 
 def test_questions_are_about_configurations_that_are_run_in_one_panel():
-    panels = [{configuration.name for configuration in panel.configurations} for panel in SMALL.panels]
+    run = (*SMALL.panels, *PPO_ONLY.panels)
+    panels = [{configuration.name for configuration in panel.configurations} for panel in run]
     for question in QUESTIONS:
         assert any({question.configuration, question.against} <= names for names in panels), question
 
@@ -52,8 +53,9 @@ def test_each_run_has_a_key_and_a_folder_of_its_own():
         assert len({job.key for job in jobs}) == len({job.folder for job in jobs}) == len(jobs)
 
 
-def test_small_takes_two_cores_two_hours():
-    assert sum(map(SMALL.expected_s, SMALL.jobs())) / 2 < 120 * 60
+def test_small_and_ppo_take_two_cores_two_hours_each():
+    for size in (SMALL, PPO_ONLY):
+        assert sum(map(size.expected_s, size.jobs())) / 2 < 120 * 60
 
 
 def test_thesis_has_twenty_seeds_of_states_and_five_of_images_at_least():
