@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -39,6 +42,41 @@ def test_the_kernel_gives_what_slicing_gives(stack, channels, crop):
     np.testing.assert_array_equal(out, sliced(frames, slots, y, x, height, width))
     for guard in around:
         assert (guard == 77).all()
+
+
+@pytest.mark.parametrize("width", [*range(1, 24), 40])
+def test_colour_images_of_any_width_are_stacked_in_whole_vectors(width):
+    rng = np.random.default_rng(width)
+    frames, _ = within(rng.integers(0, 256, (4, 9, 40, 3), np.uint8))
+    slots = rng.integers(0, 4, (5, 3))
+    slots[0], slots[2], slots[-1] = 3, 3, 0  # beyond the last bytes there is nothing to read, whichever stack has them
+    for y, x in {(0, 0), (1, 40 - width)}:
+        out, around = within(np.zeros((5, 8, width, 9), np.uint8))
+        gather_and_crop(frames, slots, y, x, out)
+        np.testing.assert_array_equal(out, sliced(frames, slots, y, x, 8, width))
+        for guard in around:
+            assert (guard == 77).all()
+
+
+READS_THE_LAST_FRAME = """
+import mmap, sys
+import numpy as np
+from common.frame_ring.kernel import gather_and_crop
+
+page = mmap.PAGESIZE
+with open(sys.argv[1], "r+b") as file:
+    file.truncate(2 * page)
+    mapped = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ)
+    file.truncate(page)  # who reads the second page now is killed
+frames = np.frombuffer(mapped, np.uint8, page // 48 * 48, page % 48).reshape(4, 4, -1, 3)
+gather_and_crop(frames, np.full((3, 3), 3), 0, 0, np.zeros((3, 4, frames.shape[2], 9), np.uint8))
+"""
+
+
+def test_nothing_beyond_the_frames_is_read(tmp_path):
+    path = tmp_path / "frames"
+    path.touch()
+    subprocess.run([sys.executable, "-c", READS_THE_LAST_FRAME, path], check=True)
 
 
 def test_frames_and_results_need_not_be_contiguous():
