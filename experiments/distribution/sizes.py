@@ -106,7 +106,7 @@ SMALL = Size(
     "small",
     (
         _sac("dot_reacher", 5000, 20),
-        _sac("visual_dot_reacher", 5000, 5),
+        _sac("visual_dot_reacher", 5000, 10),
         _pending("dot_reacher", 5000, 20),
     ),
 )
