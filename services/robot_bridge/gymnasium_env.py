@@ -105,6 +105,7 @@ class TaskEnv(Env[Observation, Float32Array]):
         if seed is not None:
             # The task was built with this generator and keeps it, so it is not replaced but set.
             self._rng.bit_generator.state = self.np_random.bit_generator.state
+            self._task.renew()
         if self._ledger is None or self._needs_new_goal or new_goal or seed is not None:
             self._ledger = Ledger(self.task_spec)
             self._task.begin_episode()

@@ -110,7 +110,7 @@ def _in_range(picture: UInt8Array, low: tuple[int, ...], high: tuple[int, ...]) 
 
 def share(mask: Mask) -> float:
     """Return the mask's share of the picture, 0 to 1."""
-    return np.count_nonzero(mask) / mask.size
+    return int(np.count_nonzero(mask)) / mask.size
 
 
 def largest_blob(mask: Mask) -> Blob | None:

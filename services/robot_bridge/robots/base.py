@@ -35,6 +35,10 @@ class SimulatedRobot(ABC):
     def advance(self, duration_ns: int) -> None:
         """Let ``duration_ns`` pass."""
 
+    def counters(self) -> dict[str, float]:
+        """Counts of the robot's own; they may be asked for by any thread."""
+        return {}
+
     @abstractmethod
     def sense(self) -> np.ndarray:
         """Read the sensors (P,), physical units, as they would show the present state without any noise."""

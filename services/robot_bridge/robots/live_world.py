@@ -55,6 +55,10 @@ class LiveWorld:
         """Packets of the sensors, ever."""
         return self._world.packets
 
+    def counters(self) -> dict[str, float]:
+        """What the robot counts."""
+        return self._world.counters()
+
     def advance_to(self, now_ns: int) -> None:
         """Tell that the world has ended, if it has; it goes on by itself.
 

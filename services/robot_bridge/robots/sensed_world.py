@@ -80,6 +80,10 @@ class SensedWorld:
         release_ns = self.camera.release_ns
         return min(self._packet_due_ns, self._frame_due_ns, sys.maxsize if release_ns is None else release_ns)
 
+    def counters(self) -> dict[str, float]:
+        """What the robot counts; for any thread."""
+        return self.robot.counters()
+
     def place(self, goal: np.ndarray, start: np.ndarray, seed: int) -> None:
         """Place goal and robot now; all noise follows from ``seed`` from here on."""
         of_sensors, of_camera = np.random.default_rng(seed).spawn(2)

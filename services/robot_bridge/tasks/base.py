@@ -62,6 +62,9 @@ class Task(ABC):
         In lockstep nobody calls it. What a command or a time means is the same either way.
         """
 
+    def renew(self) -> None:  # noqa: B027 - most worlds begin anew with each episode
+        """Let the next episode follow from the randomness alone, whatever was before, as in a world just built."""
+
     @abstractmethod
     def begin_episode(self) -> None:
         """Draw a new goal and put the robot at a random start."""

@@ -173,7 +173,8 @@ class RobotTask(Task):
 
     def counters(self) -> dict[str, float]:
         """How many packets the sensors have sent, and frames the camera has captured: their rates, over time."""
-        return {"sensor_packets": self._world.packets, "camera_frames": self._world.camera.frames}
+        rates = {"sensor_packets": self._world.packets, "camera_frames": self._world.camera.frames}
+        return {**rates, **self._world.counters()}
 
     def close(self) -> None:
         super().close()
