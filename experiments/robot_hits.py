@@ -53,6 +53,7 @@ class ThesisHits:
 TABLE = (
     ThesisHits("ur5_visual_reacher_min_time", 6.0, "14.4 ± 2.5", 10, 19),
     ThesisHits("create_reacher", 15.0, "18.8 ± 3.9", 13, 26),
+    ThesisHits("vector_charger_detector", 30.0, "11.0 ± 1.1", 7, 16),
 )
 """Table 8.1, the robots that are simulated."""
 

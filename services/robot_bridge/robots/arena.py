@@ -50,7 +50,7 @@ class Look:
 
 
 def scene_xml(name: str, arena: Arena, look: Look, *, targets: str, materials: str, robot: str) -> str:
-    """Return the scene as MJCF; its joints are the robot's x, y and yaw, and its roll, by which it is on its back.
+    """Return the scene as MJCF; its joints are the robot's x, y and yaw; the robot may have one more.
 
     Args:
         name: of the model.
