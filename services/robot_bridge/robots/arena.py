@@ -90,7 +90,7 @@ def scene_xml(name: str, arena: Arena, look: Look, *, targets: str, materials: s
   <statistic center="0 0 0" extent="{size}"/>
   <visual>
     <headlight ambient=".42 .42 .42" diffuse=".28 .28 .28" specular="0 0 0"/>
-    <map znear="{0.004 / size}" zfar="8"/>
+    <map znear="{0.004 / size}" zfar="8" shadowclip="2"/>
     <quality numslices="32" numstacks="2"/>
   </visual>
   <default>
@@ -110,7 +110,7 @@ def scene_xml(name: str, arena: Arena, look: Look, *, targets: str, materials: s
     {materials}
   </asset>
   <worldbody>
-    <light directional="true" pos="1 -1 3" dir="-.35 .45 -1" diffuse=".42 .42 .40" specular=".2 .2 .2"/>
+    <light directional="true" pos="{0.45 * size} {-0.45 * size} {1.4 * size}" dir="-.35 .45 -1" diffuse=".42 .42 .40" specular=".2 .2 .2"/>
     <camera name="{ROOM_CAMERA}" {look.room_camera}/>
     <geom type="plane" size="{far} {far} .1" pos="0 0 {-0.002 * size}" material="ground"/>
     <geom type="plane" size="{half_length} {half_width} .1" material="floor"/>

@@ -47,7 +47,7 @@ class VectorSettings(WheeledSettings):
     """m."""
     arena_width: float = setting(0.45, low=0.1, high=20.0)
     """m."""
-    wall_height: float = setting(0.25, low=0.01, high=5.0)
+    wall_height: float = setting(0.16, low=0.01, high=5.0)
     """m."""
     field_of_view: float = setting(50.0, low=10.0, high=120.0)
     """Degrees, from the camera's picture's top to its bottom."""
