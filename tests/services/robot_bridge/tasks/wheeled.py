@@ -1,0 +1,50 @@
+"""What the tests of both robots on two wheels need."""
+
+import numpy as np
+
+from services.robot_bridge.robots.wheeled_robot import start
+from services.robot_bridge.target_detection import colour_mask
+from services.robot_bridge.tasks import load_task
+
+
+def build(name, seed=0, pacing="lockstep", **settings):
+    return load_task(name, "", settings, pacing=pacing, rng=np.random.default_rng(seed))
+
+
+def begun(name, **settings):
+    task = build(name, **settings)
+    task.advance_to(0)
+    task.begin_episode()
+    return task
+
+
+def robot_of(task):
+    return task._world.robot
+
+
+def put(task, *pose):
+    """Put the robot at a pose; return what its camera sees from there."""
+    task._world.place(np.zeros(0), start(np.array(pose), ()), 0)
+    task._forget_frames()
+    return task.read().frames[-1]
+
+
+def takes_nothing_else_for_its_target(task, material, colours, cycles):
+    """Drive about with the target painted over; True if no frame has its colour anywhere."""
+    model = robot_of(task).model
+    model.mat_rgba[model.material(material).id] = model.mat_rgba[model.material("wall").id]
+    model.mat_emission[model.material(material).id] = 0
+    rng, cycle_ns = np.random.default_rng(0), round(task.spec.action_cycle_time_s * 1e9)
+    for cycle in range(1, cycles + 1):
+        task.command(rng.choice([-1.0, 1.0], 2).astype(np.float32) * task.spec.action_high)
+        task.advance_to(cycle * cycle_ns)
+        if cycle % 20 == 0:
+            task.begin_attempt()
+        if any(colour_mask(frame, colours).any() for frame in task.read().frames):
+            return False
+    return True
+
+
+def plain(reading):
+    """All that a reading holds, to the last bit."""
+    return [(part.shape, part.tobytes()) for part in vars(reading).values()]
