@@ -18,9 +18,15 @@ def counts(*hits, task="arm", limit=150):
 
 def test_the_table_names_tasks_that_there_are_with_the_thesiss_limits():
     assert {row.task for row in robot_hits.TABLE} <= set(TASKS)
-    (ur5,) = (row for row in robot_hits.TABLE if row.task == "ur5_visual_reacher_min_time")
-    assert (ur5.limit_s, ur5.low, ur5.high) == (6.0, 10, 19)
-    assert robot_hits.limit_steps(ur5, robot_hits.TaskChoice(ur5.task, "", {})) == 150
+    expected = {
+        "ur5_visual_reacher_min_time": (6.0, 10, 19, 150),
+        "create_reacher": (15.0, 13, 26, 333),
+        "vector_charger_detector": (30.0, 7, 16, 300),
+    }
+    for row in robot_hits.TABLE:
+        limit = robot_hits.limit_steps(row, robot_hits.TaskChoice(row.task, "", {}))
+        assert expected.pop(row.task) == (row.limit_s, row.low, row.high, limit)
+    assert not expected
 
 
 @pytest.mark.parametrize(

@@ -61,13 +61,15 @@ def test_the_defaults_of_ppo_are_the_published_ones():
     assert (config.actor_lr, config.critic_lr, config.discount, config.gae_lambda) == (3e-4, 1e-3, 0.99, 0.97)
     assert (config.clip, config.adam_betas) == (0.2, (0.9, 0.999))
     assert (config.hidden_size, config.encoder_strides) == (1024, (2, 2, 2, 1))
-    ur5 = PPO_PRESETS["ur5"]
-    assert {**asdict(ur5), "replay_capacity": None} == {**asdict(config), "replay_capacity": None}
+    for robot in ("ur5", "create", "vector"):
+        preset = PPO_PRESETS[robot]
+        assert {**asdict(preset), "replay_capacity": None} == {**asdict(config), "replay_capacity": None}
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_algorithm_has_presets_for_the_tasks_of_this_repository(name):
     wanted = {"dot_reacher", "visual_dot_reacher", "noise_frames", "dm_reacher", "dm_ball_in_cup"}
+    wanted |= {"ur5", "create", "vector"}
     assert wanted <= set(presets_of(name))
 
 
