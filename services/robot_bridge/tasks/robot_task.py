@@ -79,9 +79,10 @@ class RobotTask(Task):
         self, settings: RobotSettings, *, name: str, preset: str, pacing: str, rng: np.random.Generator
     ) -> None:
         self._settings, self._rng = settings, rng
-        robot = self._build_robot()
+        self.robot = self._build_robot()
+        """In real time its world's thread alone may touch it."""
         self.spec = self._describe(name, preset, pacing)
-        self._world: SensedWorld | LiveWorld = self._build_world(robot)
+        self._world: SensedWorld | LiveWorld = self._build_world(self.robot)
         self._collected: deque[CameraFrame] = deque(maxlen=BUFFERED_FRAMES)
         """Frames that nobody has read yet."""
         self._newest_frame: CameraFrame | None = None

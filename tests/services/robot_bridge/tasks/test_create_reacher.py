@@ -15,7 +15,6 @@ from tests.services.robot_bridge.tasks.wheeled import (
     build,
     plain,
     put,
-    robot_of,
     takes_nothing_else_for_its_target,
 )
 
@@ -118,7 +117,7 @@ def test_an_attempt_begins_where_the_reset_has_driven_to_from_where_the_last_one
     task = begun(NAME)
     places = []
     for attempt in range(1, 30):
-        robot = robot_of(task)
+        robot = task.robot
         before = robot.drive.pose
         (task.begin_episode if attempt % 3 == 0 else task.begin_attempt)()
         after = robot.drive.pose
@@ -139,7 +138,7 @@ def test_a_worn_battery_is_charged_between_attempts():
     task.advance_to(2_700_000_000)
     task.begin_attempt()
     assert task.counters()["recharges"] == 1
-    assert math.hypot(*(robot_of(task).drive.pose[:2] - [0.0, 0.53])) < 0.63
+    assert math.hypot(*(task.robot.drive.pose[:2] - [0.0, 0.53])) < 0.63
 
 
 def test_an_action_that_is_no_number_stops_the_robot_and_is_named():
@@ -149,7 +148,7 @@ def test_an_action_that_is_no_number_stops_the_robot_and_is_named():
     with pytest.raises(ServiceError, match=rf"{NAME}: the robot was given the command .*nan.*it was stopped"):
         task.command(np.array([math.nan, 0], np.float32))
     task.advance_to(11 * CYCLE_NS)
-    np.testing.assert_array_equal(robot_of(task).drive.wheel_speeds, 0)
+    np.testing.assert_array_equal(task.robot.drive.wheel_speeds, 0)
 
 
 def test_in_simulated_real_time_the_task_is_the_same_as_in_lockstep():

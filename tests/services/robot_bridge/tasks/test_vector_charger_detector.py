@@ -9,7 +9,7 @@ from common.errors import ConfigError
 from services.robot_bridge.target_detection import colour_mask, largest_blob
 from services.robot_bridge.tasks.vector_charger_detector import TARGET
 from tests.services.robot_bridge.opengl import skip_without_opengl
-from tests.services.robot_bridge.tasks.wheeled import begun, build, put, robot_of, takes_nothing_else_for_its_target
+from tests.services.robot_bridge.tasks.wheeled import begun, build, put, takes_nothing_else_for_its_target
 
 NAME = "vector_charger_detector"
 CYCLE_NS = 100_000_000
@@ -125,17 +125,17 @@ def test_who_drives_against_a_wall_falls_on_its_back_until_the_reset():
     start_ns = task._world._now_ns
     for cycle in range(1, 16):
         task.advance_to(start_ns + cycle * CYCLE_NS)
-    assert robot_of(task).drive.on_its_back
+    assert task.robot.drive.on_its_back
     assert not np.array_equal(task.read().frames[-1], upright)
     task.begin_attempt()
-    assert not robot_of(task).drive.on_its_back
+    assert not task.robot.drive.on_its_back
     assert task.counters()["recoveries"] == 1
 
 
 def test_the_initial_policy_does_not_fall():
     task = begun(NAME)
     rng = np.random.default_rng(0)
-    robot = robot_of(task)
+    robot = task.robot
     robot.drive.place(np.array([0.255, 0.1, 0.0]))
     for _ in range(2000):
         robot.command(np.tanh(rng.standard_normal(2)) * 120)
@@ -145,7 +145,7 @@ def test_the_initial_policy_does_not_fall():
 
 def test_an_attempt_begins_behind_where_the_last_one_ended():
     task = begun(NAME)
-    drive, headings = robot_of(task).drive, []
+    drive, headings = task.robot.drive, []
     for _ in range(20):
         drive.place(np.array([0.0, 0.0, 0.0]))
         task.begin_attempt()

@@ -18,10 +18,6 @@ def begun(name, **settings):
     return task
 
 
-def robot_of(task):
-    return task._world.robot
-
-
 def put(task, *pose):
     """Put the robot at a pose; return what its camera sees from there."""
     task._world.place(np.zeros(0), start(np.array(pose), ()), 0)
@@ -31,7 +27,7 @@ def put(task, *pose):
 
 def takes_nothing_else_for_its_target(task, material, colours, cycles):
     """Drive about with the target painted over; True if no frame has its colour anywhere."""
-    model = robot_of(task).model
+    model = task.robot.model
     model.mat_rgba[model.material(material).id] = model.mat_rgba[model.material("wall").id]
     model.mat_emission[model.material(material).id] = 0
     rng, cycle_ns = np.random.default_rng(0), round(task.spec.action_cycle_time_s * 1e9)
