@@ -37,10 +37,10 @@ def _along(component: np.ndarray, wall: float, place: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Look:
-    """What an arena looks like from outside of what is told by its sizes."""
+    """What an arena looks like, besides its sizes. Colours are red, green and blue, 0 to 1."""
 
     floor: str
-    """Colours (red green blue) of the floor inside."""
+    """Of the floor inside."""
     floor_tile: str
     """Of its other tiles."""
     wall: str
@@ -110,7 +110,8 @@ def scene_xml(name: str, arena: Arena, look: Look, *, targets: str, materials: s
     {materials}
   </asset>
   <worldbody>
-    <light directional="true" pos="{0.45 * size} {-0.45 * size} {1.4 * size}" dir="-.35 .45 -1" diffuse=".42 .42 .40" specular=".2 .2 .2"/>
+    <light directional="true" pos="{0.45 * size} {-0.45 * size} {1.4 * size}" dir="-.35 .45 -1"
+      diffuse=".42 .42 .40" specular=".2 .2 .2"/>
     <camera name="{ROOM_CAMERA}" {look.room_camera}/>
     <geom type="plane" size="{far} {far} .1" pos="0 0 {-0.002 * size}" material="ground"/>
     <geom type="plane" size="{half_length} {half_width} .1" material="floor"/>
