@@ -28,8 +28,8 @@ CAMERA_FORWARD = 0.05
 """m, of the webcam in front of the wheels' axis."""
 DOCK_WIDTH = 0.16
 LOOK = Look(
-    floor=".50 .49 .47",
-    floor_tile=".46 .45 .43",
+    floor=".66 .65 .62",
+    floor_tile=".61 .60 .57",
     wall=".72 .60 .45",
     room_camera='pos="1.05 -2.05 2.2" xyaxes=".89 .456 0 -.319 .623 .714" fovy="48"',
 )

@@ -3,7 +3,7 @@
 import numpy as np
 
 from services.robot_bridge.robots.wheeled_robot import start
-from services.robot_bridge.target_detection import colour_mask
+from services.robot_bridge.target_detection import colour_mask, share
 from services.robot_bridge.tasks import load_task
 
 
@@ -25,20 +25,21 @@ def put(task, *pose):
     return task.read().frames[-1]
 
 
-def takes_nothing_else_for_its_target(task, material, colours, cycles):
-    """Drive about with the target painted over; True if no frame has its colour anywhere."""
+def share_of_others(task, material, colours, cycles):
+    """Drive about with the target painted over; return the largest share of a frame that has its colour still."""
     model = task.robot.model
     model.mat_rgba[model.material(material).id] = model.mat_rgba[model.material("wall").id]
     model.mat_emission[model.material(material).id] = 0
+    task.read()  # what was drawn before
+    largest = 0.0
     rng, cycle_ns = np.random.default_rng(0), round(task.spec.action_cycle_time_s * 1e9)
     for cycle in range(1, cycles + 1):
         task.command(rng.choice([-1.0, 1.0], 2).astype(np.float32) * task.spec.action_high)
         task.advance_to(cycle * cycle_ns)
         if cycle % 20 == 0:
             task.begin_attempt()
-        if any(colour_mask(frame, colours).any() for frame in task.read().frames):
-            return False
-    return True
+        largest = max(largest, *(share(colour_mask(frame, colours)) for frame in task.read().frames), 0.0)
+    return largest
 
 
 def plain(reading):
