@@ -56,5 +56,6 @@ PPO_PRESETS: dict[str, PPOConfig] = {
     "ur5": replace(_THESIS, replay_capacity=16_000),
     "create": replace(_THESIS, replay_capacity=16_000),
     "vector": replace(_THESIS, replay_capacity=16_000),
+    "franka": replace(_THESIS, replay_capacity=16_000),
 }
 """Preset name -> settings; a task's TaskSpec names the preset it asks for."""

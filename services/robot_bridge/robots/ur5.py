@@ -14,7 +14,7 @@ CONTROL_PERIOD_NS = 8_000_000
 """Of the controller, and between two packets of joint angles and velocities (thesis 4.3.1)."""
 COMMANDED_JOINTS = JOINTS - 1
 """Nothing is mounted that the last joint could turn."""
-MECHANICAL_ANGLE = 2 * math.pi
+MECHANICAL_ANGLE = np.full(JOINTS, 2 * math.pi)
 """rad, data sheet: every joint turns by plus or minus 360 degrees."""
 ANGLE_LOW = np.radians([50.0, -120.0, 0.0, -220.0, -120.0])
 """rad, of the commanded joints: so that neither elbow nor cable gets caught."""
@@ -23,7 +23,7 @@ ANGLE_HIGH = np.radians([140.0, -20.0, 135.0, -150.0, -70.0])
 
 def ur5_limits(acceleration: float, box_low: np.ndarray, box_high: np.ndarray) -> ArmLimits:
     """Return a UR5's limits with an acceleration (rad/s^2) and a box of one's own (3,) m."""
-    return ArmLimits(acceleration, box_low, box_high, ANGLE_LOW, ANGLE_HIGH, MECHANICAL_ANGLE)
+    return ArmLimits(acceleration, box_low, box_high, ANGLE_LOW, ANGLE_HIGH, -MECHANICAL_ANGLE, MECHANICAL_ANGLE)
 
 
 class Ur5(SimulatedRobot):

@@ -1,7 +1,6 @@
 """A UR5 at a table, a webcam at its tool, and a monitor that shows a coloured target: a MuJoCo model.
 
-All of it made of a few plain shapes, which render many times faster than a manufacturer's meshes. World frame: metres,
-z up, the monitor in front of the arm along y, the origin in the middle of the arm's foot.
+World frame: metres, z up, the monitor in front of the arm along y, the origin in the middle of the arm's foot.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.robot_bridge.mujoco_without_opengl import mujoco
+from services.robot_bridge.robots.table_room import MATERIALS, ROOM_CAMERA, VISUALS, shapes_xml, table_xml
 
 QUARTER = math.pi / 2
 UR5_DH = (
@@ -25,7 +25,7 @@ UR5_DH = (
 """(a m, alpha rad, d m) of each joint, as Universal Robots publishes them ("DH parameters for calculations of
 kinematics and dynamics"). The base stands turned by half a turn about z."""
 JOINTS = len(UR5_DH)
-TOOL, WRIST_CAMERA, ROOM_CAMERA = "tool", "wrist", "room"
+TOOL, WRIST_CAMERA = "tool", "wrist"
 CAMERA_OFFSET = 0.03
 """m, of the webcam in front of the tool's flange."""
 
@@ -121,41 +121,21 @@ def scene_xml(monitor: Monitor, field_of_view: float) -> str:
     stand = monitor.z / 2
     return f"""
 <mujoco model="ur5_visual_reacher">
-  <compiler angle="radian"/>
-  <option gravity="0 0 0"/>
+  {VISUALS}
   <statistic center="0 .3 .3" extent="1.5"/>
-  <visual>
-    <headlight ambient=".42 .42 .42" diffuse=".28 .28 .28" specular="0 0 0"/>
-    <map znear=".004" zfar="12"/>
-    <quality numslices="24" numstacks="2"/>
-  </visual>
-  <default>
-    <geom contype="0" conaffinity="0"/>
-  </default>
   <asset>
-    <texture name="floor" type="2d" builtin="checker" width="64" height="64" rgb1=".40 .42 .45" rgb2=".36 .38 .41"/>
-    <material name="floor" texture="floor" texrepeat="6 6" texuniform="true" specular="0"/>
-    <material name="wall" rgba=".80 .81 .79 1" specular="0"/>
-    <material name="table" rgba=".66 .55 .42 1" specular="0"/>
-    <material name="leg" rgba=".30 .31 .33 1" specular="0"/>
+    {MATERIALS}
     <material name="metal" rgba=".76 .78 .80 1" specular=".4" shininess=".6"/>
     <material name="blue" rgba=".30 .60 .82 1" specular=".2"/>
-    <material name="dark" rgba=".16 .17 .18 1" specular=".2"/>
-    <material name="black" rgba=".05 .05 .06 1" specular="0"/>
     <material name="screen" rgba="1 1 1 1" emission="1" specular="0"/>
     <material name="target" rgba=".90 .05 .05 1" emission="1" specular="0"/>
   </asset>
   <worldbody>
     <light directional="true" pos="1 -1 3" dir="-.35 .45 -1" diffuse=".42 .42 .40" specular=".2 .2 .2"/>
     <camera name="{ROOM_CAMERA}" pos="1.75 -.95 1.2" xyaxes=".638 .770 0 -.305 .253 .918" fovy="40"/>
-    <geom name="floor" type="plane" size="4 4 .1" pos="0 0 -.74" material="floor"/>
+    {table_xml(0, 0.55)}
     <geom name="wall" type="box" size="4 .02 1.6" pos="0 {monitor.distance + 0.62} .86" material="wall"/>
     <geom name="side wall" type="box" size=".02 4 1.6" pos="-2.2 0 .86" material="wall"/>
-    <geom name="table" type="box" size=".75 .75 .02" pos="0 .55 -.02" material="table"/>
-    <geom type="box" size=".03 .03 .35" pos="-.69 -.14 -.39" material="leg"/>
-    <geom type="box" size=".03 .03 .35" pos=".69 -.14 -.39" material="leg"/>
-    <geom type="box" size=".03 .03 .35" pos="-.69 1.24 -.39" material="leg"/>
-    <geom type="box" size=".03 .03 .35" pos=".69 1.24 -.39" material="leg"/>
     <body name="monitor" pos="{monitor.x} {monitor.distance} {monitor.z}">
       <geom type="box" size="{half_width + 0.012} .014 {half_height + 0.012}" pos="0 .0195 0" material="black"/>
       <geom type="box" size=".035 .012 {stand / 2 + 0.05}" pos="0 .04 {-1.5 * stand + 0.05}" material="dark"/>
@@ -183,20 +163,12 @@ def _arm_xml(field_of_view: float) -> str:
     """
     for number, ((a, alpha, d), shapes) in reversed(list(enumerate(zip(UR5_DH, _LINKS, strict=True)))):
         frame = "tool frame" if number == JOINTS - 1 else f"frame {number + 1}"
-        geometries = "\n".join(
-            f'<geom type="cylinder" size="{radius}" fromto="{_text(start)} {_text(end)}" material="{material}"/>'
-            for material, radius, start, end in shapes
-        )
         # The body's own frame is that of the joint before, whose z is this joint's axis.
         inside = f"""
           <body name="link {number + 1}">
             <joint name="joint {number + 1}" axis="0 0 1"/>
-            {geometries}
+            {shapes_xml(shapes)}
             <body name="{frame}" pos="{a} 0 {d}" euler="{alpha} 0 0">{inside}</body>
           </body>
         """
     return inside
-
-
-def _text(point: tuple[float, ...]) -> str:
-    return " ".join(str(coordinate) for coordinate in point)

@@ -36,8 +36,10 @@ class ArmLimits:
     """(n,) rad: a commanded joint beyond this ..."""
     angle_high: np.ndarray
     """(n,) rad: ... or this turns back, at the largest speed that was commanded of any joint."""
-    mechanical_angle: float
-    """rad: no joint turns further than plus or minus this."""
+    mechanical_low: np.ndarray
+    """(nq,) rad, of all joints: none turns below this ..."""
+    mechanical_high: np.ndarray
+    """(nq,) rad: ... or above this."""
 
 
 class VelocityArm:
@@ -158,9 +160,9 @@ class VelocityArm:
 
     def _end_period(self) -> None:
         angles = self._angles + self._velocities * self._period_s
-        limit = self._limits.mechanical_angle
-        self._velocities[np.abs(angles) > limit] = 0.0
-        self._angles = np.clip(angles, -limit, limit)
+        low, high = self._limits.mechanical_low, self._limits.mechanical_high
+        self._velocities[(angles < low) | (angles > high)] = 0.0
+        self._angles = np.clip(angles, low, high)
         self._into_period_ns = 0
         self._show()
 

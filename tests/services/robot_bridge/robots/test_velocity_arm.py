@@ -29,7 +29,13 @@ def build(box_low=-ANYWHERE, box_high=ANYWHERE, angle=10.0, mechanical_angle=7.0
     model = mujoco.MjModel.from_xml_string(TWO_HINGES)
     data = mujoco.MjData(model)
     limits = ArmLimits(
-        ACCELERATION, np.array(box_low), np.array(box_high), np.full(2, -angle), np.full(2, angle), mechanical_angle
+        ACCELERATION,
+        np.array(box_low),
+        np.array(box_high),
+        np.full(2, -angle),
+        np.full(2, angle),
+        np.full(3, -2 * mechanical_angle),
+        np.full(3, mechanical_angle),
     )
     return VelocityArm(model, data, tool="tool", limits=limits, period_ns=PERIOD_NS)
 
@@ -175,6 +181,10 @@ def test_no_joint_turns_beyond_what_the_mechanics_allow():
     arm.command(np.array([1.0, 0.0]))
     arm.advance(3_000_000_000)
     np.testing.assert_allclose(arm.angles, [0.2, 0])
+    np.testing.assert_array_equal(arm.velocities, [0, 0])
+    arm.command(np.array([0.0, -1.0]))
+    arm.advance(3_000_000_000)
+    np.testing.assert_allclose(arm.angles, [0.2, -0.4])
 
 
 def test_a_placed_arm_is_at_rest_and_has_forgotten_its_command():
