@@ -42,9 +42,17 @@ TOOL_TURN = -math.pi / 4
 CAMERA_PLACE: Point = (0.05, 0.0, 0.02)
 """m, of the webcam in the tool's frame: x away from the arm in the start postures, z where the tool points."""
 
+_FOOT_ROUND: tuple[Shape, ...] = (
+    ("white", 0.062, (0, 0, 0.062), (0, 0, 0.080)),
+    ("white", 0.052, (-0.09, 0, 0.052), (0, 0, 0.060)),
+)
+_FOOT_FLAT: tuple[Shape, ...] = (
+    ("dark", 0.078, (0, 0, 0), (0, 0, 0.012)),
+    ("white", 0.062, (0, 0, 0.080), (0, 0, 0.141)),
+)
 # For each link, shapes in the frame of its joint, whose axis is z: round ones, and flat ones that cap them.
 _ROUND: tuple[tuple[Shape, ...], ...] = (
-    (("white", 0.058, (0, 0, -0.180), (0, 0, -0.010)), ("white", 0.056, (0, -0.030, 0), (0, 0.030, 0))),
+    (("white", 0.058, (0, 0, -0.180), (0, 0, -0.010)), ("white", 0.056, (0, -0.010, 0), (0, 0.010, 0))),
     (("white", 0.054, (0, 0, 0), (0, -0.190, 0)),),
     (("white", 0.054, (0, 0, -0.110), (0, 0, -0.060)), ("white", 0.050, (0, 0, -0.060), (0.0825, 0, 0))),
     (("white", 0.050, (0, 0, 0), (-0.0825, 0.075, 0)), ("white", 0.050, (-0.0825, 0.075, 0), (-0.0825, 0.110, 0))),
@@ -124,9 +132,8 @@ def scene_xml(bag: BeanBag, field_of_view: float) -> str:
     <geom name="side wall" type="box" size=".02 4 1.6" pos="-1.4 0 .86" material="wall"/>
     <geom name="bag" type="ellipsoid" size="{bag.radius} {bag.radius} {half_height}" pos=".6 0 {half_height / 2}"
       material="bag"/>
-    <geom type="cylinder" size=".085 .006" pos="0 0 .006" material="dark"/>
-    {shapes_xml([("white", 0.068, (0, 0, 0.055), (0, 0, 0.080)), ("white", 0.055, (-0.09, 0, 0.055), (0, 0, 0.055))], "capsule")}
-    {shapes_xml([("white", 0.062, (0, 0, 0.08), (0, 0, 0.141))])}
+    {shapes_xml(_FOOT_ROUND, "capsule")}
+    {shapes_xml(_FOOT_FLAT)}
     {_arm_xml(field_of_view)}
   </worldbody>
 </mujoco>
