@@ -1,9 +1,15 @@
-"""``python -m services.robot_bridge --config FILE``: tethered to the robot, runs its action cycle."""
+"""``python -m services.robot_bridge --config FILE``: tethered to the robot, runs its action cycle.
+
+``python -m services.robot_bridge --task T --preview DIR`` draws a simulated robot's task instead.
+"""
 
 from __future__ import annotations
 
 import logging
+import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -20,6 +26,8 @@ from services.robot_bridge.cameras import Camera, PictureSize, open_camera
 from services.robot_bridge.config import RobotBridgeConfig
 from services.robot_bridge.tasks import Task, load_task
 
+PREVIEW_OPTIONS = ("--preview", "--task")
+"""Whoever gives one of these wants to see a task and no service."""
 logger = logging.getLogger(__name__)
 
 
@@ -80,5 +88,15 @@ def _earlier(directory: Path) -> tuple[Totals, str | None]:
     return totals, latched
 
 
+def main(arguments: Sequence[str]) -> NoReturn:
+    """Serve, or draw a preview, as the command line says; then end the process."""
+    if any(argument.partition("=")[0] in PREVIEW_OPTIONS for argument in arguments):
+        # Not before: a bridge whose task has no simulated robot needs no MuJoCo.
+        from services.robot_bridge import preview
+
+        sys.exit(preview.main(arguments))
+    end_process(run_service(topics.ROBOT_BRIDGE, RobotBridgeConfig, serve, arguments, description=__doc__))
+
+
 if __name__ == "__main__":
-    end_process(run_service(topics.ROBOT_BRIDGE, RobotBridgeConfig, serve, description=__doc__))
+    main(sys.argv[1:])

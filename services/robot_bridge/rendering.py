@@ -35,8 +35,9 @@ _ANY_BACKEND = ("", "enable", "enabled", "on", "true", "1")
 _NO_BACKEND = ("disable", "disabled", "off", "false", "0")
 MOST_GEOMETRIES = 200
 """Room for a scene's geometries; MuJoCo's default of 10 000 costs time with each picture."""
+SHADOW_MAP, SAMPLES, SLICES, STACKS = 8192, 4, 48, 24
+"""Where effects are wanted: resolution of shadows, samples a pixel, faces around a round shape and along it."""
 COSTLY_EFFECTS = (
-    mujoco.mjtRndFlag.mjRND_SHADOW,
     mujoco.mjtRndFlag.mjRND_REFLECTION,
     mujoco.mjtRndFlag.mjRND_SKYBOX,
     mujoco.mjtRndFlag.mjRND_HAZE,
@@ -63,13 +64,21 @@ class OffscreenCamera:
     the whole picture with all effects. The model's visual settings are changed accordingly.
     """
 
-    def __init__(self, model: mujoco.MjModel, window: Window, camera: str | None = None) -> None:
-        """Open a camera of ``model`` by its name; None is the free camera, which shows the whole model."""
+    def __init__(
+        self, model: mujoco.MjModel, window: Window, camera: str | None = None, *, effects: bool = False
+    ) -> None:
+        """Args:
+        model: what there is to see.
+        window: that is drawn.
+        camera: the camera's name; None is the free camera, which shows the whole model.
+        effects: draw shadows, smooth edges and round shapes: slow, for people to look at.
+        """
         self._model = model
         self._mjr_context: mujoco.MjrContext | None = None
         self._gl_context: Any = None
-        model.vis.quality.shadowsize = 0
-        model.vis.quality.offsamples = 0
+        quality = model.vis.quality
+        quality.shadowsize, quality.offsamples = (SHADOW_MAP, SAMPLES) if effects else (0, 0)
+        slices_stacks = quality.numslices, quality.numstacks
         model.vis.global_.offheight, model.vis.global_.offwidth = window.height, window.width
         # The window is the whole frame buffer. The picture around it is clipped before anything is drawn.
         bottom = window.picture_height - window.top - window.height
@@ -80,6 +89,7 @@ class OffscreenCamera:
         self._scene = mujoco.MjvScene(model=model, maxgeom=MOST_GEOMETRIES)
         for effect in COSTLY_EFFECTS:
             self._scene.flags[effect] = 0
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = effects
         self._camera = mujoco.MjvCamera()
         if camera is None:
             mujoco.mjv_defaultFreeCamera(model, self._camera)
@@ -90,7 +100,10 @@ class OffscreenCamera:
         with _opening:
             self._gl_context = context_class(window.width, window.height)
             with _in_use(self._gl_context):
+                if effects:
+                    quality.numslices, quality.numstacks = SLICES, STACKS
                 self._mjr_context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+                quality.numslices, quality.numstacks = slices_stacks
                 mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr_context)
             _open_cameras.add(self)
 

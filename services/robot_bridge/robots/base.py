@@ -8,6 +8,9 @@ import numpy as np
 
 from services.robot_bridge.mujoco_without_opengl import mujoco
 
+ROOM_CAMERA = "room"
+"""A model's camera of this name shows the robot from outside, for people to look at."""
+
 
 class SimulatedRobot(ABC):
     """A robot and its surroundings; :class:`~services.robot_bridge.robots.sensed_world.SensedWorld` gives it senses.

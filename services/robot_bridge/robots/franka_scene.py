@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.robot_bridge.mujoco_without_opengl import mujoco
+from services.robot_bridge.robots.base import ROOM_CAMERA
 from services.robot_bridge.robots.table_room import (
     MATERIALS,
-    ROOM_CAMERA,
     VISUALS,
     Point,
     Shape,

@@ -11,8 +11,6 @@ Point = tuple[float, float, float]
 """m."""
 Shape = tuple[str, float, Point, Point]
 """Material, radius and the two ends of its axis, m."""
-ROOM_CAMERA = "room"
-"""Each scene has a camera of this name, which shows the robot from outside."""
 VISUALS = """
   <compiler angle="radian"/>
   <option gravity="0 0 0"/>

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.robot_bridge.mujoco_without_opengl import mujoco
-from services.robot_bridge.robots.table_room import MATERIALS, ROOM_CAMERA, VISUALS, shapes_xml, table_xml
+from services.robot_bridge.robots.base import ROOM_CAMERA
+from services.robot_bridge.robots.table_room import MATERIALS, VISUALS, shapes_xml, table_xml
 
 QUARTER = math.pi / 2
 UR5_DH = (

@@ -78,6 +78,7 @@ class FrankaVisualReacher(RobotTask):
     RATES = Rates(sensors_ns=CONTROL_PERIOD_NS, camera_hz=30)
     VIEW = View(WRIST_CAMERA, height=90, width=160, frame_stack=3)
     ALGORITHM_PRESET = "franka"
+    TARGET_RANGE = TARGET
     PRESETS: ClassVar = {"demo": {}, "disturbed": DISTURBED}
     _settings: FrankaSettings
 

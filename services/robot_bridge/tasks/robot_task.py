@@ -23,6 +23,7 @@ from services.robot_bridge.cameras.simulated import BUFFERED_FRAMES, CameraDefec
 from services.robot_bridge.robots.base import SimulatedRobot
 from services.robot_bridge.robots.live_world import LiveWorld
 from services.robot_bridge.robots.sensed_world import Rates, SensedWorld
+from services.robot_bridge.target_detection import ColourRange
 from services.robot_bridge.tasks.base import Outcome, SensorReading, Task
 
 _LARGEST_SEED = 2**63 - 1
@@ -74,13 +75,15 @@ class RobotTask(Task):
     VIEW: ClassVar[View]
     ALGORITHM_PRESET: ClassVar[str]
     HAS_GOAL: ClassVar[bool] = True
+    TARGET_RANGE: ClassVar[ColourRange | None] = None
+    """The colours that count as the target; None if colour alone does not tell."""
 
     def __init__(
         self, settings: RobotSettings, *, name: str, preset: str, pacing: str, rng: np.random.Generator
     ) -> None:
         self._settings, self._rng = settings, rng
         self.robot = self._build_robot()
-        """In real time its world's thread alone may touch it."""
+        """The robot; in real time the world\'s thread alone may touch it from :meth:`start` on."""
         self.spec = self._describe(name, preset, pacing)
         self._world: SensedWorld | LiveWorld = self._build_world(self.robot)
         self._collected: deque[CameraFrame] = deque(maxlen=BUFFERED_FRAMES)

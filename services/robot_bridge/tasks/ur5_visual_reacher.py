@@ -121,6 +121,7 @@ class _Ur5Task(RobotTask):
     RATES = Rates(sensors_ns=CONTROL_PERIOD_NS, camera_hz=30)
     VIEW = View(WRIST_CAMERA, height=90, width=160, frame_stack=3)
     ALGORITHM_PRESET = "ur5"
+    TARGET_RANGE = TARGET
     PRESETS: ClassVar = {"demo": {}, "disturbed": DISTURBED}
     _settings: Ur5Settings
 

@@ -1,0 +1,148 @@
+"""``python -m services.robot_bridge --task T --preview DIR``: a simulated robot's task, to look at before it is learnt.
+
+An episode under the initial policy, actions at random, as a video ``DIR/T.mp4`` and a contact sheet ``DIR/T.png``: what
+the agent sees, what of it is taken for the target, and the robot from outside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common.config import parse_override
+from common.errors import ConfigError, RelodError
+from common.messages import TaskSpec, UInt8Array
+from services.robot_bridge.preview_pictures import contact_sheet, panels, write_picture, write_video
+from services.robot_bridge.rendering import OffscreenCamera, Window
+from services.robot_bridge.robots.base import ROOM_CAMERA, SimulatedRobot
+from services.robot_bridge.target_detection import Mask, colour_mask
+from services.robot_bridge.tasks import load_task
+from services.robot_bridge.tasks.robot_task import RobotTask
+
+PROGRAM = "services.robot_bridge"
+LONGEST_S = 10.0
+"""Of the world's time: an episode that has not ended by then is not shown to its end."""
+ROOM_WIDTH, ROOM_HEIGHT = 960, 540
+"""Of the picture from outside, pixels."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What there is to see at the end of an action cycle."""
+
+    time_s: float
+    """Since the episode began."""
+    frame: UInt8Array
+    """(H, W, 3): the newest one."""
+    mask: Mask | None
+    """(H, W): what is taken for the target; None if its colour alone does not tell."""
+    room: UInt8Array
+    """(ROOM_HEIGHT, ROOM_WIDTH, 3)."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Draw what the command line asks for; return the exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        task = _task(options)
+        with closing(task):
+            name = task.spec.task
+            shown = [(moment, panels(moment.frame, moment.mask, moment.room)) for moment in moments(task, options.seed)]
+        pictures = [picture for _, picture in shown]
+        paths = options.preview / f"{name}.png", options.preview / f"{name}.mp4"
+        write_picture(paths[0], contact_sheet([(_label(moment), picture) for moment, picture in shown]))
+        write_video(paths[1], pictures, 1 / task.spec.action_cycle_time_s)
+    except RelodError as error:
+        print(f"{PROGRAM}: error: {error}", file=sys.stderr)
+        return 1
+    print("\n".join(str(path) for path in paths))
+    return 0
+
+
+def moments(task: RobotTask, seed: int) -> Iterator[Moment]:
+    """Let the initial policy, tanh of N(0, 1), act in a task in lockstep, until it ends an episode."""
+    spec = task.spec
+    cycle_ns = round(spec.action_cycle_time_s * 1e9)
+    rng = np.random.default_rng(seed)
+    task.advance_to(0)
+    task.begin_episode()
+    frame = task.read().frames[-1]
+    attempt_steps = 0
+    with closing(_room_camera(task.robot)) as room:
+        for cycle in range(1, round(LONGEST_S / spec.action_cycle_time_s) + 1):
+            task.command(_random_action(spec, rng))
+            task.advance_to(cycle * cycle_ns)
+            attempt_steps += 1
+            new = task.read().frames
+            frame = new[-1] if len(new) else frame
+            mask = None if task.TARGET_RANGE is None else colour_mask(frame, task.TARGET_RANGE)
+            yield Moment(cycle * spec.action_cycle_time_s, frame, mask, room.picture(task.robot.data))
+            if task.outcome().terminated:
+                return
+            if attempt_steps == spec.time_limit_steps:
+                task.begin_attempt() if spec.has_goal else task.begin_episode()
+                frame = task.read().frames[-1]
+                attempt_steps = 0
+
+
+def _random_action(spec: TaskSpec, rng: np.random.Generator) -> np.ndarray:
+    middle, half = (spec.action_high + spec.action_low) / 2, (spec.action_high - spec.action_low) / 2
+    action: np.ndarray = middle + half * np.tanh(rng.standard_normal(len(half), np.float32))
+    return action
+
+
+def _room_camera(robot: SimulatedRobot) -> OffscreenCamera:
+    """The model's camera that shows the robot from outside; if it has none, one that shows everything."""
+    model = robot.model
+    names = {model.camera(number).name for number in range(model.ncam)}
+    window = Window(0, 0, ROOM_HEIGHT, ROOM_WIDTH, ROOM_HEIGHT, ROOM_WIDTH)
+    return OffscreenCamera(model, window, ROOM_CAMERA if ROOM_CAMERA in names else None, effects=True)
+
+
+def _label(moment: Moment) -> str:
+    text = f"{moment.time_s:.2f} s"
+    return text if moment.mask is None else f"{text}   target: {100 * float(moment.mask.mean()):.1f} % of the image"
+
+
+def _task(options: argparse.Namespace) -> RobotTask:
+    name, equals, target = options.task.partition("=")
+    overrides: dict[str, Any] = {}
+    for override in options.set:
+        section, key, value = parse_override(override)
+        if section != "task":
+            raise ConfigError(f"--set {override}: only settings of the task count here: expected task.key=value")
+        overrides[key] = value
+    rows = {name: target} if equals else {}
+    task = load_task(name, options.preset, overrides, rows, rng=np.random.default_rng(options.seed))
+    if not isinstance(task, RobotTask):
+        task.close()
+        raise ConfigError(f"--task {name}: it is no simulated robot: expected one such as ur5_visual_reacher")
+    return task
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {PROGRAM}",
+        description="Let a random policy act on a simulated robot; write a video DIR/T.mp4 and a contact sheet "
+        "DIR/T.png of what the agent sees, what of it is taken for the target, and the robot from outside.",
+        epilog=f"example: python -m {PROGRAM} --task ur5_visual_reacher_min_time --preview runs/preview",
+    )
+    parser.add_argument("--task", required=True, metavar="T", help="task id, or id=module:Class for one of your own")
+    parser.add_argument("--preview", required=True, type=Path, metavar="DIR", help="folder for video and sheet")
+    parser.add_argument("--preset", default="", metavar="NAME", help="of the task (default: the task's first)")
+    parser.add_argument("--set", action="append", default=[], metavar="task.KEY=VALUE", help="override a setting")
+    parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="of everything random (default: 0)")
+    return parser
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number, 0 or more, got {text}")
+    return int(text)
