@@ -13,7 +13,12 @@ from benchmarks.side import Prepared, UnavailableError, repeated
 from benchmarks.table import Budget
 
 REACHER = "reacher_easy_visual"
-ROBOTS = {"ur5": "ur5_visual_reacher_min_time", "create": "create_reacher", "vector": "vector_charger_detector"}
+ROBOTS = {
+    "ur5": "ur5_visual_reacher_min_time",
+    "franka": "franka_visual_reacher",
+    "create": "create_reacher",
+    "vector": "vector_charger_detector",
+}
 """Name in the rows -> task."""
 STEPS = 500
 PICTURES = 200

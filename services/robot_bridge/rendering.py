@@ -35,7 +35,7 @@ _ANY_BACKEND = ("", "enable", "enabled", "on", "true", "1")
 _NO_BACKEND = ("disable", "disabled", "off", "false", "0")
 MOST_GEOMETRIES = 200
 """Room for a scene's geometries; MuJoCo's default of 10 000 costs time with each picture."""
-SHADOW_MAP, SAMPLES, SLICES, STACKS = 8192, 4, 48, 24
+SHADOW_MAP, SAMPLES, SLICES, STACKS = 2048, 4, 48, 24
 """Where effects are wanted: resolution of shadows, samples a pixel, faces around a round shape and along it."""
 COSTLY_EFFECTS = (
     mujoco.mjtRndFlag.mjRND_REFLECTION,

@@ -117,6 +117,9 @@ def scene_xml(bag: BeanBag, field_of_view: float) -> str:
     return f"""
 <mujoco model="franka_visual_reacher">
   {VISUALS}
+  <visual>
+    <quality numslices="24" numstacks="8"/>
+  </visual>
   <statistic center=".3 0 .3" extent="1.5"/>
   <asset>
     {MATERIALS}
@@ -125,7 +128,7 @@ def scene_xml(bag: BeanBag, field_of_view: float) -> str:
     <material name="bag" rgba=".75 .02 .12 1" emission=".3" specular="0"/>
   </asset>
   <worldbody>
-    <light directional="true" pos="1 -1 3" dir="-.45 .35 -1" diffuse=".42 .42 .40" specular=".2 .2 .2"/>
+    <light directional="true" pos="1.66 -.98 3" dir="-.45 .35 -1" diffuse=".42 .42 .40" specular=".2 .2 .2"/>
     <camera name="{ROOM_CAMERA}" pos="1.65 -1.15 .95" xyaxes=".657 .754 0 -.270 .235 .934" fovy="40"/>
     {table_xml(0.35, 0)}
     <geom name="wall" type="box" size="4 .02 1.6" pos="0 1.4 .86" material="wall"/>

@@ -1,0 +1,161 @@
+"""A robot's task to look at: what is drawn, what is written, and clear words where it cannot be."""
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+
+from common.errors import ServiceError
+from services.robot_bridge import __main__, preview, rendering
+from services.robot_bridge.preview_pictures import COLUMNS, GAP, LABEL_HEIGHT, TILE_WIDTH, TILES, contact_sheet, panels
+from services.robot_bridge.tasks import load_task
+from tests.services.robot_bridge.opengl import skip_without_opengl
+
+FRANKA = "franka_visual_reacher"
+SHORT = ["--set", "task.action_cycle_time=0.5", "--set", "task.time_limit=6"]
+"""20 cycles, two attempts ended by time."""
+
+
+@pytest.fixture
+def opengl(monkeypatch):
+    skip_without_opengl()
+    # The picture from outside, small and coarse: it takes most of the time.
+    monkeypatch.setattr(preview, "ROOM_WIDTH", 192)
+    monkeypatch.setattr(preview, "ROOM_HEIGHT", 108)
+    monkeypatch.setattr(rendering, "SHADOW_MAP", 128)
+
+
+def run(directory, *arguments, task=FRANKA):
+    return preview.main(["--task", task, "--preview", str(directory), *arguments])
+
+
+def video_frames(path):
+    video = cv2.VideoCapture(str(path))
+    frames = []
+    while (read := video.read())[0]:
+        frames.append(read[1][..., ::-1])
+    rate = video.get(cv2.CAP_PROP_FPS)
+    video.release()
+    return frames, rate
+
+
+def test_an_episode_becomes_a_video_and_a_contact_sheet(opengl, tmp_path, capsys):
+    assert run(tmp_path / "new", *SHORT) == 0
+    sheet, video = tmp_path / "new" / f"{FRANKA}.png", tmp_path / "new" / f"{FRANKA}.mp4"
+    assert capsys.readouterr().out.split() == [str(sheet), str(video)]
+    frames, rate = video_frames(video)
+    assert rate == 2
+    assert {frame.shape for frame in frames} == {(540, 1440, 3)}
+    assert 1 <= len(frames) <= 20
+    picture = cv2.imread(str(sheet))
+    assert picture.shape[1] == GAP + COLUMNS * (TILE_WIDTH + GAP)
+    # The agent's view is of the table's brown, the mask is black and white, the room is neither.
+    first = frames[0]
+    red, green, blue = np.median(first[:270, :480], axis=(0, 1))
+    assert red > green + 15 > blue + 30
+    mask = first[270:, :480]
+    assert ((mask < 40) | (mask > 215)).mean() > 0.99
+    assert first[:, 480:].std() > 10
+
+
+def test_the_moments_show_frame_mask_and_robot_of_the_same_time(opengl):
+    task = load_task(FRANKA, overrides={"action_cycle_time": 0.2, "time_limit": 4}, rng=np.random.default_rng(0))
+    shown = list(itertools.islice(preview.moments(task, 0), 8))
+    task.close()
+    assert [moment.time_s for moment in shown] == pytest.approx(0.2 * np.arange(1, len(shown) + 1))
+    for moment in shown:
+        red = moment.frame[..., 0].astype(int) - moment.frame[..., 1]
+        assert np.array_equal(moment.mask, red > 100)  # nothing else is red
+    assert len({moment.room.tobytes() for moment in shown}) == len(shown)  # the arm moves on
+
+
+def test_the_same_seed_draws_the_same_and_another_seed_another(opengl):
+    def frames(seed):
+        task = load_task(FRANKA, overrides={"action_cycle_time": 1.0}, rng=np.random.default_rng(seed))
+        with_masks = [moment.frame.tobytes() for moment in preview.moments(task, seed)]
+        task.close()
+        return with_masks
+
+    assert frames(0) == frames(0) != frames(1)
+
+
+def test_a_picture_has_the_enlarged_view_above_the_mask_and_the_room_beside_them():
+    frame = np.zeros((90, 160, 3), np.uint8)
+    frame[0, 1] = (200, 10, 20)
+    mask = np.zeros((90, 160), bool)
+    mask[89, 159] = True
+    picture = panels(frame, mask, np.full((540, 960, 3), 77, np.uint8))
+    assert picture.shape == (540, 480 + 960, 3)
+    assert (picture[:3, 3:6] == (200, 10, 20)).all()
+    assert picture[:270, :480].any(axis=-1).sum() == 9
+    assert (picture[537:, 477:480] == 255).all()
+    assert picture[270:, :480].any(axis=-1).sum() == 9
+    assert (picture[:, 480:] == 77).all()
+    assert not panels(frame, None, np.zeros((540, 960, 3), np.uint8))[270:].any()
+
+
+@pytest.mark.parametrize(("count", "tiles"), [(1, 1), (5, 5), (12, 12), (251, 12)])
+def test_a_sheet_goes_from_the_first_to_the_last(count, tiles):
+    shown = [(str(number), np.full((54, 108, 3), number, np.uint8)) for number in range(count)]
+    sheet = contact_sheet(shown)
+    rows = -(-tiles // COLUMNS)
+    assert sheet.shape[0] == GAP + rows * (270 + LABEL_HEIGHT + GAP)
+    assert TILES == 12
+    assert (sheet[GAP + LABEL_HEIGHT : GAP + LABEL_HEIGHT + 270, GAP : GAP + TILE_WIDTH] == 0).all()
+    row, column = divmod(tiles - 1, COLUMNS)
+    top, left = GAP + row * (270 + LABEL_HEIGHT + GAP) + LABEL_HEIGHT, GAP + column * (TILE_WIDTH + GAP)
+    assert (sheet[top : top + 270, left : left + TILE_WIDTH] == count - 1).all()
+
+
+# ---------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("arguments", "task", "match"),
+    [
+        ([], "dot_reacher", "--task dot_reacher: it is no simulated robot: expected one such as ur5_visual_reacher"),
+        ([], "nobody", "'nobody'"),
+        (["--set", "run.id=x"], FRANKA, "--set run.id=x: only settings of the task count here"),
+        (["--set", "task.bag_radius=0"], FRANKA, "bag_radius"),
+        (["--preset", "thesis"], FRANKA, "preset = 'thesis'"),
+    ],
+)
+def test_what_cannot_be_drawn_is_named(arguments, task, match, tmp_path, capsys):
+    assert run(tmp_path, *arguments, task=task) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("services.robot_bridge: error: ")
+    assert match in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_written_to_is_named(opengl, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert run(tmp_path / "file", *SHORT, "--set", "task.threshold=0") == 1
+    assert f"--preview {tmp_path / 'file'}: cannot be written to" in capsys.readouterr().err
+
+
+def test_without_opengl_the_error_says_what_to_do(tmp_path, capsys, monkeypatch):
+    def refuse(*_, **__):
+        raise ServiceError("this task has a camera, and no OpenGL backend works here")
+
+    monkeypatch.setattr(preview, "OffscreenCamera", refuse)
+    monkeypatch.setattr("services.robot_bridge.cameras.simulated.OffscreenCamera", refuse)
+    assert run(tmp_path) == 1
+    assert "no OpenGL backend works here" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("argument", ["--preview", "--preview=x", "--task", "--task=x"])
+def test_the_bridges_command_line_knows_who_wants_a_preview(argument, monkeypatch):
+    monkeypatch.setattr(preview, "main", lambda arguments: 7 if arguments == ["first", argument] else 1)
+    with pytest.raises(SystemExit) as ended:
+        __main__.main(["first", argument])
+    assert ended.value.code == 7
+
+
+def test_help_names_both_options_and_gives_an_example(capsys):
+    with pytest.raises(SystemExit) as ended:
+        preview.main(["--help"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert all(part in text for part in ("--task T", "--preview DIR", "example:"))
