@@ -52,11 +52,11 @@ class ThesisHits:
 
 TABLE = (
     ThesisHits("ur5_visual_reacher_min_time", 6.0, "14.4 ± 2.5", 10, 19),
-    ThesisHits("create_reacher", 15.0, "18.8 ± 3.9", 13, 26),
-    ThesisHits("vector_charger_detector", 30.0, "11.0 ± 1.1", 7, 16),
     ThesisHits("franka_visual_reacher", 3.0, "12.6 ± 1.0", 8, 18),
     ThesisHits("franka_visual_reacher", 6.0, "13.0 ± 2.1"),
     ThesisHits("franka_visual_reacher", 30.0, "7.8 ± 0.9"),
+    ThesisHits("create_reacher", 15.0, "18.8 ± 3.9", 13, 26),
+    ThesisHits("vector_charger_detector", 30.0, "11.0 ± 1.1", 7, 16),
 )
 """Table 8.1, the robots that are simulated."""
 

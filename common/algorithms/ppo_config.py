@@ -54,8 +54,8 @@ PPO_PRESETS: dict[str, PPOConfig] = {
     "dm_reacher": replace(_THESIS, replay_capacity=10_000),
     "dm_ball_in_cup": replace(_THESIS, replay_capacity=10_000),
     "ur5": replace(_THESIS, replay_capacity=16_000),
+    "franka": replace(_THESIS, replay_capacity=16_000),
     "create": replace(_THESIS, replay_capacity=16_000),
     "vector": replace(_THESIS, replay_capacity=16_000),
-    "franka": replace(_THESIS, replay_capacity=16_000),
 }
 """Preset name -> settings; a task's TaskSpec names the preset it asks for."""

@@ -25,9 +25,9 @@ TASKS = {
     "ball_in_cup_visual": "services.robot_bridge.tasks.ball_in_cup:BallInCupVisual",
     "ur5_visual_reacher": "services.robot_bridge.tasks.ur5_visual_reacher:Ur5VisualReacher",
     "ur5_visual_reacher_min_time": "services.robot_bridge.tasks.ur5_visual_reacher:Ur5VisualReacherMinTime",
+    "franka_visual_reacher": "services.robot_bridge.tasks.franka_visual_reacher:FrankaVisualReacher",
     "create_reacher": "services.robot_bridge.tasks.create_reacher:CreateReacher",
     "vector_charger_detector": "services.robot_bridge.tasks.vector_charger_detector:VectorChargerDetector",
-    "franka_visual_reacher": "services.robot_bridge.tasks.franka_visual_reacher:FrankaVisualReacher",
     "noise_frames": "services.robot_bridge.tasks.noise_frames:NoiseFrames",
 }
 """Task id -> ``module:Class``; imported only when chosen, so that a robot's driver burdens no one else."""

@@ -42,17 +42,17 @@ class FrankaSettings(RobotSettings):
     """rad/s: a joint that is told to turn faster turns at this."""
     acceleration: float = setting(5.0, low=0.1, high=15.0)
     """rad/s^2, of the joint whose speed has to change most."""
-    posture_low: list[float] = setting([-0.1, 0.13, 0.02, -2.25, 0.03, 2.05, 0.8])
+    posture_low: list[float] = setting([-0.2, 0.13, 0.02, -2.25, 0.03, 2.05, 0.8])
     """rad: each joint starts from here ..."""
-    posture_high: list[float] = setting([0.1, 0.13, 0.02, -2.0, 0.03, 2.15, 0.8])
+    posture_high: list[float] = setting([0.2, 0.13, 0.02, -2.0, 0.03, 2.15, 0.8])
     """rad: ... to here."""
     box_low: list[float] = setting([0.3, -0.3, 0.08])
     """m: where the flange may be, from here ..."""
     box_high: list[float] = setting([0.7, 0.3, 0.4])
     """m: ... to here; outside it is driven back."""
-    bag_low: list[float] = setting([0.5, -0.1])
+    bag_low: list[float] = setting([0.45, -0.1])
     """m: the bag lies, x and y, from here ..."""
-    bag_high: list[float] = setting([0.7, 0.1])
+    bag_high: list[float] = setting([0.65, 0.1])
     """m: ... to here."""
     bag_radius: float = setting(0.05, low=0.01, high=0.15)
     """m."""
