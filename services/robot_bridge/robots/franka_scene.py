@@ -129,10 +129,10 @@ def scene_xml(bag: BeanBag, field_of_view: float) -> str:
   </asset>
   <worldbody>
     <light directional="true" pos="1.66 -.98 3" dir="-.45 .35 -1" diffuse=".42 .42 .40" specular=".2 .2 .2"/>
-    <camera name="{ROOM_CAMERA}" pos="1.65 -1.15 .95" xyaxes=".657 .754 0 -.270 .235 .934" fovy="40"/>
+    <camera name="{ROOM_CAMERA}" pos="1.65 -1.15 .95" xyaxes=".657 .754 0 -.270 .235 .934" fovy="36"/>
     {table_xml(0.35, 0)}
-    <geom name="wall" type="box" size="4 .02 1.6" pos="0 1.4 .86" material="wall"/>
-    <geom name="side wall" type="box" size=".02 4 1.6" pos="-1.4 0 .86" material="wall"/>
+    <geom name="wall" type="box" size="4 .02 1.6" pos="0 2.2 .86" material="wall"/>
+    <geom name="side wall" type="box" size=".02 4 1.6" pos="-2.2 0 .86" material="wall"/>
     <geom name="bag" type="ellipsoid" size="{bag.radius} {bag.radius} {half_height}" pos=".6 0 {half_height / 2}"
       material="bag"/>
     {shapes_xml(_FOOT_ROUND, "capsule")}
