@@ -34,8 +34,8 @@ ANGLE_MARGIN = 0.05
 class FrankaSettings(RobotSettings):
     """Keys of ``[task]``. World frame: metres, x away from the arm, z up, the origin in the arm's foot."""
 
-    reset_steps: int = setting(150, low=0)
-    """Action cycles that a reset takes: 6 s, in which arm and bag are put elsewhere."""
+    reset_steps: int = setting(100, low=0)
+    """Action cycles that a reset takes: 4 s, in which arm and bag are put elsewhere."""
     action_limit: float = setting(1.0, low=0.01, high=2.175)
     """rad/s, the bound of the actions."""
     max_speed: float = setting(0.2, low=0.01, high=2.175)

@@ -71,7 +71,7 @@ def test_the_task_is_that_of_the_thesis():
     assert spec.frame_shape.tolist() == [90, 160, 3]
     assert (spec.frame_stack, spec.crop_margin.tolist()) == (3, [9, 16])
     assert (spec.action_cycle_time_s, spec.world_seconds_per_cycle) == (0.04, 0.04)
-    assert (spec.time_limit_steps, spec.has_goal) == (150, True)
+    assert (spec.time_limit_steps, spec.reset_steps, spec.has_goal) == (150, 100, True)
     assert spec.algorithm_presets == {"sac": "franka", "ppo": "franka"}
     assert len(spec.proprioception_low) == 14  # seven angles, seven velocities
 
