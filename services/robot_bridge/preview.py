@@ -1,7 +1,7 @@
 """``python -m services.robot_bridge --task T --preview DIR``: a simulated robot's task, to look at before it is learnt.
 
-An episode under the initial policy, actions at random, as a video ``DIR/T.mp4`` and a contact sheet ``DIR/T.png``: what
-the agent sees, what of it is taken for the target, and the robot from outside.
+The initial policy, actions at random, as a video ``DIR/T.mp4`` and a contact sheet ``DIR/T.png``: what the agent sees,
+what of it is taken for the target, and the robot from outside.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from services.robot_bridge.tasks import load_task
 from services.robot_bridge.tasks.robot_task import RobotTask
 
 PROGRAM = "services.robot_bridge"
-LONGEST_S = 10.0
-"""Of the world's time: an episode that has not ended by then is not shown to its end."""
+DURATION_S = 10.0
+"""Of the world's time, whatever ends in it."""
 ROOM_WIDTH, ROOM_HEIGHT = 960, 540
 """Of the picture from outside, pixels."""
 
@@ -38,13 +38,15 @@ class Moment:
     """What there is to see at the end of an action cycle."""
 
     time_s: float
-    """Since the episode began."""
+    """Since the first episode began."""
     frame: UInt8Array
     """(H, W, 3): the newest one."""
     mask: Mask | None
-    """(H, W): what is taken for the target; None if its colour alone does not tell."""
+    """(H, W): what has the target's colours; None if it is not found by them."""
     room: UInt8Array
     """(ROOM_HEIGHT, ROOM_WIDTH, 3)."""
+    at_goal: bool
+    """True if the episode ends here."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -67,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def moments(task: RobotTask, seed: int) -> Iterator[Moment]:
-    """Let the initial policy, tanh of N(0, 1), act in a task in lockstep, until it ends an episode."""
+    """Let the initial policy, tanh of N(0, 1), act in a task in lockstep, episode after episode."""
     spec = task.spec
     cycle_ns = round(spec.action_cycle_time_s * 1e9)
     rng = np.random.default_rng(seed)
@@ -76,18 +78,17 @@ def moments(task: RobotTask, seed: int) -> Iterator[Moment]:
     frame = task.read().frames[-1]
     attempt_steps = 0
     with closing(_room_camera(task.robot)) as room:
-        for cycle in range(1, round(LONGEST_S / spec.action_cycle_time_s) + 1):
+        for cycle in range(1, round(DURATION_S / spec.action_cycle_time_s) + 1):
             task.command(_random_action(spec, rng))
             task.advance_to(cycle * cycle_ns)
             attempt_steps += 1
             new = task.read().frames
             frame = new[-1] if len(new) else frame
             mask = None if task.TARGET_RANGE is None else colour_mask(frame, task.TARGET_RANGE)
-            yield Moment(cycle * spec.action_cycle_time_s, frame, mask, room.picture(task.robot.data))
-            if task.outcome().terminated:
-                return
-            if attempt_steps == spec.time_limit_steps:
-                task.begin_attempt() if spec.has_goal else task.begin_episode()
+            at_goal = task.outcome().terminated
+            yield Moment(cycle * spec.action_cycle_time_s, frame, mask, room.picture(task.robot.data), at_goal)
+            if at_goal or attempt_steps == spec.time_limit_steps:
+                task.begin_attempt() if spec.has_goal and not at_goal else task.begin_episode()
                 frame = task.read().frames[-1]
                 attempt_steps = 0
 
@@ -108,7 +109,9 @@ def _room_camera(robot: SimulatedRobot) -> OffscreenCamera:
 
 def _label(moment: Moment) -> str:
     text = f"{moment.time_s:.2f} s"
-    return text if moment.mask is None else f"{text}   target: {100 * float(moment.mask.mean()):.1f} % of the image"
+    if moment.mask is not None:
+        text += f"   target: {100 * float(moment.mask.mean()):.1f} % of the image"
+    return text + "   goal" * moment.at_goal
 
 
 def _task(options: argparse.Namespace) -> RobotTask:

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-FRONT_CAMERA, ROOM_CAMERA = "front", "room"
+from services.robot_bridge.robots.base import ROOM_CAMERA
+
+FRONT_CAMERA = "front"
 _WALL_THICKNESS = 0.02
 
 

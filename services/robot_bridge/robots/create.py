@@ -31,7 +31,7 @@ LOOK = Look(
     floor=".66 .65 .62",
     floor_tile=".61 .60 .57",
     wall=".72 .60 .45",
-    room_camera='pos="1.05 -2.05 2.2" xyaxes=".89 .456 0 -.319 .623 .714" fovy="48"',
+    room_camera='pos="1.05 -2.05 2.2" xyaxes=".89 .456 0 -.319 .623 .714" fovy="42"',
 )
 
 

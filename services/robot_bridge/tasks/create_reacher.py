@@ -75,6 +75,7 @@ class CreateReacher(WheeledRobotTask):
     RATES = Rates(sensors_ns=PACKET_PERIOD_NS, camera_hz=30)
     VIEW = View(FRONT_CAMERA, height=120, width=160, frame_stack=3)
     ALGORITHM_PRESET = "create"
+    TARGET_RANGE = TARGET
     RADIUS = RADIUS
     _settings: CreateSettings
 

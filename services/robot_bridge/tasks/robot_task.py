@@ -76,14 +76,14 @@ class RobotTask(Task):
     ALGORITHM_PRESET: ClassVar[str]
     HAS_GOAL: ClassVar[bool] = True
     TARGET_RANGE: ClassVar[ColourRange | None] = None
-    """The colours that count as the target; None if colour alone does not tell."""
+    """The target's colours; None if it is not found by them."""
 
     def __init__(
         self, settings: RobotSettings, *, name: str, preset: str, pacing: str, rng: np.random.Generator
     ) -> None:
         self._settings, self._rng = settings, rng
         self.robot = self._build_robot()
-        """The robot; in real time the world\'s thread alone may touch it from :meth:`start` on."""
+        """The robot; in real time the world's thread alone may touch it from :meth:`start` on."""
         self.spec = self._describe(name, preset, pacing)
         self._world: SensedWorld | LiveWorld = self._build_world(self.robot)
         self._collected: deque[CameraFrame] = deque(maxlen=BUFFERED_FRAMES)

@@ -47,7 +47,7 @@ def test_an_episode_becomes_a_video_and_a_contact_sheet(opengl, tmp_path, capsys
     frames, rate = video_frames(video)
     assert rate == 2
     assert {frame.shape for frame in frames} == {(540, 1440, 3)}
-    assert 1 <= len(frames) <= 20
+    assert len(frames) == 20
     picture = cv2.imread(str(sheet))
     assert picture.shape[1] == GAP + COLUMNS * (TILE_WIDTH + GAP)
     # The agent's view is of the table's brown, the mask is black and white, the room is neither.
@@ -68,6 +68,18 @@ def test_the_moments_show_frame_mask_and_robot_of_the_same_time(opengl):
         red = moment.frame[..., 0].astype(int) - moment.frame[..., 1]
         assert np.array_equal(moment.mask, red > 100)  # nothing else is red
     assert len({moment.room.tobytes() for moment in shown}) == len(shown)  # the arm moves on
+
+
+def test_after_a_goal_another_episode_begins(opengl, monkeypatch):
+    overrides = {"action_cycle_time": 1.0, "threshold": 0.0}  # the goal: as soon as there is any red
+    task = load_task(FRANKA, overrides=overrides, rng=np.random.default_rng(0))
+    episodes, begin_episode = [], task.begin_episode
+    monkeypatch.setattr(task, "begin_episode", lambda: (episodes.append(1), begin_episode()))
+    shown = list(preview.moments(task, 0))
+    task.close()
+    assert len(shown) == 10
+    assert [moment.at_goal for moment in shown] == [moment.mask.any() for moment in shown]
+    assert sum(moment.at_goal for moment in shown) == len(episodes) - 1 >= 2
 
 
 def test_the_same_seed_draws_the_same_and_another_seed_another(opengl):
