@@ -25,7 +25,7 @@ from services.actor.config import ActorConfig
 from services.learner.config import LearnerConfig
 from services.replay.config import ReplayConfig
 from services.robot_bridge.config import RobotBridgeConfig
-from services.robot_bridge.tasks import TASKS
+from services.robot_bridge.tasks import task_table
 
 CONFIG_CLASSES: dict[str, type[Any]] = {
     ROBOT_BRIDGE: RobotBridgeConfig,
@@ -259,7 +259,7 @@ def _apply_override(tables: Mapping[str, Tables], override: str) -> None:
 
 def _check_task(bridge: RobotBridgeConfig) -> None:
     """Fail here rather than in a service that the others wait for."""
-    known = [*TASKS, *bridge.tasks.rows]
+    known = task_table(bridge.tasks.rows)
     if bridge.task.name not in known:
         close = difflib.get_close_matches(bridge.task.name, known, 1)
         hint = f"; did you mean {close[0]!r}?" if close else ""

@@ -270,6 +270,25 @@ def test_a_row_that_leads_to_no_task_is_named(target):
         load_task("mine", rows={"mine": target}, rng=np.random.default_rng(0))
 
 
+@pytest.mark.parametrize(
+    ("target", "match"),
+    [
+        ("nowhere:Task", "No module named 'nowhere'; the folder that it is in has to be on PYTHONPATH"),
+        ("services.robot_bridge.tasks:Nobody", "has no attribute 'Nobody'"),
+        ("os.path:join", "expected a subclass of Task"),
+    ],
+)
+def test_the_error_says_why_a_row_leads_to_no_task(target, match):
+    with pytest.raises(ConfigError, match=match):
+        load_task("mine", rows={"mine": target}, rng=np.random.default_rng(0))
+
+
+def test_a_row_cannot_take_the_name_of_another_task():
+    rows = {"create_reacher": "services.robot_bridge.tasks.dot_reacher:DotReacher"}
+    with pytest.raises(ConfigError, match=r"\[tasks\] create_reacher: this name is taken, by .*:CreateReacher"):
+        load_task("dot_reacher", rows=rows, rng=np.random.default_rng(0))
+
+
 # ---------------------------------------------------------------------- the dot
 
 

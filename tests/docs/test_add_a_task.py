@@ -1,76 +1,45 @@
 """docs/add-a-task.md, followed literally."""
 
-import inspect
 import json
 import os
-import re
 import shlex
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from services.robot_bridge.bookkeeping import Ledger
 from services.robot_bridge.tasks import TASKS, load_task
-from tests.conformance import test_tasks as conformance
+from tests.docs.task_pages import ROOT, Page, conformance_checks
 
-ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "add-a-task.md").read_text(encoding="utf-8")
-
-
-def block(language, containing=""):
-    """The page's one block of code in ``language`` that contains some text."""
-    found = [code for code in re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL) if containing in code]
-    assert len(found) == 1, f"{len(found)} blocks of {language} contain {containing!r}"
-    return found[0]
-
-
-def conformance_checks():
-    """Every check of the conformance test that is made for each task of the table, with each set of its arguments."""
-    checks = []
-    for check_name, check in inspect.getmembers(conformance, inspect.isfunction):
-        parameters = set(inspect.signature(check).parameters)
-        if not check_name.startswith("test_") or "name" not in parameters:
-            continue
-        marks = [mark.args for mark in getattr(check, "pytestmark", []) if mark.name == "parametrize"]
-        if marks == [(("name", "preset"), conformance.PRESETS)]:
-            names, values = ("preset",), [("demo",), ("narrow",)]
-        elif not marks:
-            names, values = (), [()]
-        elif "name" in np.ravel([names for names, _ in marks]):
-            continue  # it names the tasks that it is about
-        else:
-            ((names, values),) = marks
-        assert parameters == {"name", *names}
-        checks += [pytest.param(check, dict(zip(names, v, strict=True)), id=f"{check_name}{v}") for v in values]
-    return checks
+PAGE = Page("add-a-task.md")
+CHECKS = conformance_checks("demo", "narrow")
 
 
 @pytest.fixture
 def my_tasks(tmp_path, monkeypatch):
     """The folder with the page's file, where Python finds it."""
-    (tmp_path / "toy.py").write_text(block("python"), encoding="utf-8")
+    (tmp_path / "toy.py").write_text(PAGE.block("python"), encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     yield tmp_path
     sys.modules.pop("toy", None)
 
 
-@pytest.mark.parametrize(("check", "arguments"), conformance_checks())
+@pytest.mark.parametrize(("check", "arguments"), CHECKS)
 def test_the_task_passes_the_checks_of_every_task(my_tasks, monkeypatch, check, arguments):
-    monkeypatch.setitem(TASKS, "toy", tomllib.loads(block("toml"))["tasks"]["toy"])
+    monkeypatch.setitem(TASKS, "toy", tomllib.loads(PAGE.block("toml"))["tasks"]["toy"])
     check(name="toy", **arguments)
 
 
 def test_there_are_such_checks():
-    assert len(conformance_checks()) >= 20
+    assert len(CHECKS) >= 20
 
 
 @pytest.mark.parametrize("preset", ["demo", "narrow"])
 def test_with_the_pages_row_an_episode_runs_in_lockstep_to_its_goal(my_tasks, preset):
-    rows = tomllib.loads(block("toml"))["tasks"]
+    rows = tomllib.loads(PAGE.block("toml"))["tasks"]
     task = load_task("toy", preset, {"time_limit": 7}, rows, rng=np.random.default_rng(2))
     ledger, now_ns, episode, ends = Ledger(task.spec), 0, None, []
     task.advance_to(now_ns)
@@ -96,7 +65,7 @@ def test_with_the_pages_row_an_episode_runs_in_lockstep_to_its_goal(my_tasks, pr
 
 
 def test_the_pages_command_lets_the_four_services_learn_it(my_tasks, tmp_path):
-    command = shlex.split(block("bash", "deploy.launch"))
+    command = shlex.split(PAGE.block("bash", "deploy.launch"))
     assert command[:2] == ["PYTHONPATH=my_tasks", "python"]
     run_dir = tmp_path / "run"
     result = subprocess.run(
@@ -116,13 +85,10 @@ def test_the_pages_command_lets_the_four_services_learn_it(my_tasks, tmp_path):
 
 
 def test_the_pages_check_is_the_conformance_test():
-    command = shlex.split(block("bash", "pytest"))
+    command = shlex.split(PAGE.block("bash", "pytest"))
     assert command[:4] == ["python", "-m", "pytest", "tests/conformance/test_tasks.py"]
     assert ROOT.joinpath(command[3]).is_file()
 
 
 def test_files_the_page_links_to_exist():
-    links = re.findall(r"\]\(([^)#]+)\)", PAGE)
-    assert len(links) >= 4
-    for link in links:
-        assert (ROOT / "docs" / link).exists(), link
+    assert not PAGE.missing_files()

@@ -8,7 +8,7 @@ from typing import Any
 from common.clock import Clock
 from common.config import build_section
 from services.robot_bridge.cameras.base import Camera, CameraFrame, PictureSize
-from services.robot_bridge.class_table import load_class
+from services.robot_bridge.class_table import extended, load_class
 
 CAMERAS = {
     "opencv": "services.robot_bridge.cameras.opencv:OpenCVCamera",
@@ -40,7 +40,7 @@ def open_camera(
         ConfigError: unknown kind or setting, or a value out of range.
         CameraError: there is no such camera, nothing comes from it, or its pictures are of another size.
     """
-    camera_class: Any = load_class(Camera, name, {**CAMERAS, **(rows or {})}, "camera")
+    camera_class: Any = load_class(Camera, name, extended(CAMERAS, rows, "camera"), "camera")
     settings: Any = build_section(camera_class.SETTINGS, overrides or {}, f"[camera] {name}")
     camera: Camera = camera_class(settings, size=size, clock=clock)
     return camera

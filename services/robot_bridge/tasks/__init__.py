@@ -9,7 +9,7 @@ import numpy as np
 
 from common.config import build_section
 from common.errors import ConfigError
-from services.robot_bridge.class_table import load_class
+from services.robot_bridge.class_table import extended, load_class
 from services.robot_bridge.tasks.base import Outcome, SensorReading, Task
 
 TASKS = {
@@ -32,7 +32,16 @@ TASKS = {
 }
 """Task id -> ``module:Class``; imported only when chosen, so that a robot's driver burdens no one else."""
 
-__all__ = ["TASKS", "Outcome", "SensorReading", "Task", "load_task"]
+__all__ = ["TASKS", "Outcome", "SensorReading", "Task", "load_task", "task_table"]
+
+
+def task_table(rows: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the table of tasks with more rows, ``[tasks]`` of the bridge's configuration.
+
+    Raises:
+        ConfigError: a row's name is taken.
+    """
+    return extended(TASKS, rows, "task")
 
 
 def load_task(
@@ -55,9 +64,9 @@ def load_task(
         rng: all of the task's randomness.
 
     Raises:
-        ConfigError: unknown task, preset or setting, or a value out of range.
+        ConfigError: unknown task, preset or setting, a value out of range, or a row that leads to no task.
     """
-    task_class = load_class(Task, name, {**TASKS, **(rows or {})}, "task")
+    task_class = load_class(Task, name, task_table(rows), "task")
     preset = preset or next(iter(task_class.PRESETS))
     if preset not in task_class.PRESETS:
         raise ConfigError(f"[task] preset = {preset!r}: task {name} has the presets {', '.join(task_class.PRESETS)}")
