@@ -5,15 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from common.errors import ConfigError, ServiceError
-from experiments.simulation import SimulatedClock
+from common.errors import ConfigError
 from services.robot_bridge.target_detection import colour_mask, largest_blob, share
 from services.robot_bridge.tasks.create_reacher import TARGET
 from tests.services.robot_bridge.opengl import skip_without_opengl
 from tests.services.robot_bridge.tasks.wheeled import (
     begun,
     build,
-    plain,
     put,
     share_of_others,
 )
@@ -140,41 +138,3 @@ def test_a_worn_battery_is_charged_between_attempts():
     task.begin_attempt()
     assert task.counters()["recharges"] == 1
     assert math.hypot(*(task.robot.drive.pose[:2] - [0.0, 0.53])) < 0.63
-
-
-def test_an_action_that_is_no_number_stops_the_robot_and_is_named():
-    task = begun(NAME)
-    task.command(task.spec.action_high)
-    task.advance_to(10 * CYCLE_NS)
-    with pytest.raises(ServiceError, match=rf"{NAME}: the robot was given the command .*nan.*it was stopped"):
-        task.command(np.array([math.nan, 0], np.float32))
-    task.advance_to(11 * CYCLE_NS)
-    np.testing.assert_array_equal(task.robot.drive.wheel_speeds, 0)
-
-
-def test_in_simulated_real_time_the_task_is_the_same_as_in_lockstep():
-    clock = SimulatedClock()
-    live, lockstep = build(NAME, pacing="realtime", seed=3), build(NAME, seed=3)
-    live.start(clock)
-    begun_ns, condition, shown = clock.now_ns(), clock.condition(), {}
-    rng = np.random.default_rng(0)
-    for task in (live, lockstep):
-        task.advance_to(begun_ns)
-        task.begin_episode()
-        shown[task] = [plain(task.read())]
-    for cycle in range(1, 21):
-        now_ns = begun_ns + cycle * 45_300_000  # never at the time of a packet or of a frame
-        with condition:
-            clock.wait_until(now_ns, condition)
-        action = rng.uniform(live.spec.action_low, live.spec.action_high).astype(np.float32)
-        for task in (live, lockstep):
-            task.advance_to(now_ns)
-            shown[task] += [task.outcome(), plain(task.read())]
-            task.command(action)
-            if cycle == 12:
-                task.begin_attempt()
-                shown[task].append(plain(task.read()))
-    assert shown[live] == shown[lockstep]
-    live.close()
-    lockstep.close()
-    clock.end()

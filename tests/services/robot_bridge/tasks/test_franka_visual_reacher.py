@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from common.errors import ConfigError, ServiceError
-from experiments.simulation import SimulatedClock
+from common.errors import ConfigError
 from services.robot_bridge.target_detection import colour_mask, share
 from services.robot_bridge.tasks import load_task
 from services.robot_bridge.tasks.franka_visual_reacher import TARGET
@@ -223,55 +222,3 @@ def test_a_joint_at_its_limit_turns_back():
         highest = max(highest, float(robot_of(task).arm.angles[4]))
     # From .2 rad/s it turns within .2^2 / (2 * 5) = .004 rad, and a period's .0016 at each end.
     assert 0.4 < highest < 0.4 + 0.004 + 2 * 0.0016
-
-
-def test_an_action_beyond_its_bounds_is_clipped():
-    inside, beyond = begun(), begun()
-    inside.command(inside.spec.action_high)
-    beyond.command(np.full(7, 1e6, np.float32))
-    for task in (inside, beyond):
-        task.advance_to(10 * CYCLE_NS)
-    np.testing.assert_array_equal(inside.read().proprioception, beyond.read().proprioception)
-
-
-@pytest.mark.parametrize("value", [math.nan, -math.inf])
-def test_an_action_that_is_no_number_stops_the_arm_and_is_named(value):
-    task = begun()
-    task.command(task.spec.action_high)
-    task.advance_to(5 * CYCLE_NS)
-    with pytest.raises(ServiceError, match=rf"{NAME}: the robot was given the command .*{value}.*it was stopped"):
-        task.command(np.array([0, 0, value, 0, 0, 0, 0], np.float32))
-    task.advance_to(10 * CYCLE_NS)
-    np.testing.assert_allclose(task.read().proprioception[7:], 0, atol=1e-7)
-
-
-# ---------------------------------------------------------------------- in real time
-
-
-def test_in_simulated_real_time_the_task_is_the_same_as_in_lockstep():
-    clock = SimulatedClock()
-    live, lockstep = build(pacing="realtime", seed=3), build(seed=3)
-    live.start(clock)
-    begun_ns = clock.now_ns()
-    condition = clock.condition()
-    rng = np.random.default_rng(0)
-    shown = {live: [], lockstep: []}
-    for task in shown:
-        task.advance_to(begun_ns)
-        task.begin_episode()
-    for cycle in range(1, 16):
-        # Never at the time of a packet or of a frame.
-        now_ns = begun_ns + cycle * 40_300_000
-        with condition:
-            clock.wait_until(now_ns, condition)
-        action = rng.uniform(live.spec.action_low, live.spec.action_high).astype(np.float32)
-        for task, seen in shown.items():
-            task.advance_to(now_ns)
-            seen += [task.outcome(), [part.tobytes() for part in vars(task.read()).values()]]
-            task.command(action)
-            if cycle == 10:
-                task.begin_attempt()
-    assert shown[live] == shown[lockstep]
-    live.close()
-    lockstep.close()
-    clock.end()

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from common.errors import ConfigError, ServiceError
+from common.errors import ConfigError
 from experiments.simulation import SimulatedClock
 from services.robot_bridge.target_detection import centre_weights, colour_mask
 from services.robot_bridge.tasks import load_task
@@ -36,11 +36,6 @@ def begun(name=MIN_TIME, **settings):
 
 def arm_of(task):
     return task._world.robot.arm
-
-
-def plain(reading):
-    """All that a reading holds, to the last bit."""
-    return [(part.shape, part.tobytes()) for part in vars(reading).values()]
 
 
 def target_mask(frame):
@@ -255,58 +250,7 @@ def test_the_tool_is_kept_near_its_box_whatever_the_policy_does():
     assert farthest < 0.78 - 0.5 - 0.03  # the webcam never touches the monitor
 
 
-def test_an_action_beyond_its_bounds_is_clipped():
-    inside, beyond = begun(), begun()
-    inside.command(inside.spec.action_high)
-    beyond.command(np.full(5, 1e6, np.float32))
-    for task in (inside, beyond):
-        task.advance_to(20 * CYCLE_NS)
-    np.testing.assert_array_equal(inside.read().proprioception, beyond.read().proprioception)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_an_action_that_is_no_number_stops_the_arm_and_is_named(value):
-    task = begun()
-    task.command(task.spec.action_high)
-    task.advance_to(10 * CYCLE_NS)
-    with pytest.raises(ServiceError, match=rf"{MIN_TIME}: the robot was given the command .*{value}.*it was stopped"):
-        task.command(np.array([0, 0, value, 0, 0], np.float32))
-    task.advance_to(20 * CYCLE_NS)
-    np.testing.assert_allclose(task.read().proprioception[5:], 0, atol=1e-7)
-
-
 # ---------------------------------------------------------------------- in real time
-
-
-def test_in_simulated_real_time_the_task_is_the_same_as_in_lockstep():
-    clock = SimulatedClock()
-    live, lockstep = build(pacing="realtime", seed=3), build(seed=3)
-    live.start(clock)
-    begun_ns = clock.now_ns()
-    condition = clock.condition()
-    rng = np.random.default_rng(0)
-    shown = {}
-    for task in (live, lockstep):
-        task.advance_to(begun_ns)
-        task.begin_episode()
-        shown[task] = [plain(task.read())]
-    for cycle in range(1, 31):
-        # Never at the time of a packet or of a frame.
-        now_ns = begun_ns + cycle * 40_300_000
-        with condition:
-            clock.wait_until(now_ns, condition)
-        action = rng.uniform(live.spec.action_low, live.spec.action_high).astype(np.float32)
-        for task in (live, lockstep):
-            task.advance_to(now_ns)
-            shown[task] += [task.outcome(), plain(task.read())]
-            task.command(action)
-            if cycle == 20:
-                task.begin_attempt()
-                shown[task].append(plain(task.read()))
-    assert shown[live] == shown[lockstep]
-    live.close()
-    lockstep.close()
-    clock.end()
 
 
 def test_what_the_arm_is_doing_it_goes_on_doing_while_nobody_commands():

@@ -40,8 +40,3 @@ def share_of_others(task, material, colours, cycles):
             task.begin_attempt()
         largest = max(largest, *(share(colour_mask(frame, colours)) for frame in task.read().frames), 0.0)
     return largest
-
-
-def plain(reading):
-    """All that a reading holds, to the last bit."""
-    return [(part.shape, part.tobytes()) for part in vars(reading).values()]
