@@ -39,7 +39,7 @@ class VectorSettings(WheeledSettings):
     """Action cycles that a reset takes."""
     action_cycle_time: float = setting(0.1, low=0.001, high=10.0)
     """Seconds."""
-    max_speed: float = setting(150.0, low=1.0, high=220.0)
+    max_speed: float = setting(160.0, low=1.0, high=220.0)
     """mm/s of each wheel, the bound of the actions."""
     wheel_lag: float = setting(0.08, low=0.0, high=2.0)
     """s, in which a wheel's speed comes 63 % closer to the commanded one."""

@@ -22,15 +22,15 @@ def opengl():
 
 def test_the_task_is_that_of_the_thesis():
     spec = build(NAME).spec
-    np.testing.assert_array_equal(spec.action_high, [120.0, 120.0])
-    np.testing.assert_array_equal(spec.action_low, [-120.0, -120.0])
+    np.testing.assert_array_equal(spec.action_high, [160.0, 160.0])
+    np.testing.assert_array_equal(spec.action_low, [-160.0, -160.0])
     assert spec.frame_shape.tolist() == [120, 160, 3]
     assert spec.frame_stack == 4
     assert (spec.action_cycle_time_s, spec.world_seconds_per_cycle) == (0.1, 0.1)
     assert (spec.time_limit_steps, spec.reset_steps, spec.has_goal) == (300, 20, True)
     assert spec.algorithm_presets == {"sac": "vector", "ppo": "vector"}
-    np.testing.assert_array_equal(spec.proprioception_low, [0.0, -120.0, -120.0])
-    np.testing.assert_array_equal(spec.proprioception_high, [400.0, 120.0, 120.0])
+    np.testing.assert_array_equal(spec.proprioception_low, [0.0, -160.0, -160.0])
+    np.testing.assert_array_equal(spec.proprioception_high, [400.0, 160.0, 160.0])
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def test_the_initial_policy_does_not_fall():
     robot = task.robot
     robot.drive.place(np.array([0.255, 0.1, 0.0]))
     for _ in range(2000):
-        robot.command(np.tanh(rng.standard_normal(2)) * 120)
+        robot.command(np.tanh(rng.standard_normal(2)) * 160)
         robot.advance(CYCLE_NS)
         assert not robot.drive.on_its_back
 
