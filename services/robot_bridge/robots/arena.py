@@ -92,7 +92,7 @@ def scene_xml(name: str, arena: Arena, look: Look, *, targets: str, materials: s
   <statistic center="0 0 0" extent="{size}"/>
   <visual>
     <headlight ambient=".42 .42 .42" diffuse=".28 .28 .28" specular="0 0 0"/>
-    <map znear="{0.004 / size}" zfar="8" shadowclip="2"/>
+    <map znear="{0.004 / size}" zfar="8" shadowclip="3"/>
     <quality numslices="32" numstacks="2"/>
   </visual>
   <default>

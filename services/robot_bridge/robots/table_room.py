@@ -16,7 +16,7 @@ VISUALS = """
   <option gravity="0 0 0"/>
   <visual>
     <headlight ambient=".42 .42 .42" diffuse=".28 .28 .28" specular="0 0 0"/>
-    <map znear=".004" zfar="12"/>
+    <map znear=".004" zfar="12" shadowclip="2"/>
     <quality numslices="24" numstacks="2"/>
   </visual>
   <default>

@@ -135,8 +135,8 @@ def scene_xml(monitor: Monitor, field_of_view: float) -> str:
     <light directional="true" pos="1 -1 3" dir="-.35 .45 -1" diffuse=".42 .42 .40" specular=".2 .2 .2"/>
     <camera name="{ROOM_CAMERA}" pos="1.75 -.95 1.2" xyaxes=".638 .770 0 -.305 .253 .918" fovy="40"/>
     {table_xml(0, 0.55)}
-    <geom name="wall" type="box" size="4 .02 1.6" pos="0 {monitor.distance + 0.62} .86" material="wall"/>
-    <geom name="side wall" type="box" size=".02 4 1.6" pos="-2.2 0 .86" material="wall"/>
+    <geom name="wall" type="box" size="4 .02 2.5" pos="0 {monitor.distance + 0.62} 1.76" material="wall"/>
+    <geom name="side wall" type="box" size=".02 4 2.5" pos="-2.2 0 1.76" material="wall"/>
     <body name="monitor" pos="{monitor.x} {monitor.distance} {monitor.z}">
       <geom type="box" size="{half_width + 0.012} .014 {half_height + 0.012}" pos="0 .0195 0" material="black"/>
       <geom type="box" size=".035 .012 {stand / 2 + 0.05}" pos="0 .04 {-1.5 * stand + 0.05}" material="dark"/>

@@ -32,7 +32,7 @@ LOOK = Look(
     floor=".72 .72 .70",
     floor_tile=".68 .68 .66",
     wall=".80 .72 .60",
-    room_camera='pos="-.60 -.54 .66" xyaxes=".660 -.751 0 .512 .450 .732" fovy="40"',
+    room_camera='pos="-.60 -.54 .66" xyaxes=".660 -.751 0 .512 .450 .732" fovy="42"',
 )
 
 
