@@ -11,7 +11,8 @@ short network outage costs freshness only while it lasts.
       acknowledge                 ◀─ Acknowledgement    acknowledgement  what is done, what is missing
       due() ; put on `resent`     ── message ───────▶   accept
 
-:class:`RetainedMessages` and :class:`OrderedReceiver` decide; they hold no thread and no clock.
+:class:`~common.retained_messages.RetainedMessages` and :class:`OrderedReceiver` decide; they hold no thread and no
+clock.
 :class:`JournalSender` runs the sender's side on a thread of its own.
 """
 
@@ -19,9 +20,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import OrderedDict
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -30,85 +29,16 @@ from common.clock import Clock, SystemClock
 from common.codec import decode, encode
 from common.errors import MessageError
 from common.messages import Acknowledgement, StreamHead
+from common.retained_messages import MAX_RANGES, RetainedMessages
 from common.run_settings import JournalSettings
 from common.topics import Topic
 from common.transport import Transport
 
 HEAD_PERIOD_S = 0.2
 """How often the sender tells what it holds."""
-RESEND_AFTER_S = 0.5
-"""A message is not sent again before this has passed: it may still be on its way."""
-MAX_RANGES = 64
-"""Missing ranges in one acknowledgement; the rest follow in later ones."""
 
 Item = TypeVar("Item")
 logger = logging.getLogger(__name__)
-
-
-@dataclass
-class _Retained:
-    payload: bytes
-    first_sent_ns: int
-    last_sent_ns: int
-
-
-class RetainedMessages:
-    """What the sender of one stream holds until it is acknowledged, bounded in time and memory."""
-
-    def __init__(self, max_age_ns: int, max_bytes: int) -> None:
-        self._messages: OrderedDict[int, _Retained] = OrderedDict()
-        self._max_age_ns, self._max_bytes = max_age_ns, max_bytes
-        self._acknowledged_seq = 0
-        self.next_seq = 0
-        """Number the next message will get."""
-        self.retained_bytes = 0
-        self.given_up = 0
-        """Messages dropped unacknowledged, because they were too old or too many."""
-
-    def __len__(self) -> int:
-        return len(self._messages)
-
-    @property
-    def oldest_seq(self) -> int:
-        """Oldest message that can still be resent."""
-        return next(iter(self._messages), self.next_seq)
-
-    def retain(self, seq: int, payload: bytes, now_ns: int) -> None:
-        """Keep message ``seq``, which is being sent now, unless it has been acknowledged already."""
-        if seq != self.next_seq:
-            raise ValueError(f"seq: expected {self.next_seq}, got {seq}")
-        self.next_seq += 1
-        if seq < self._acknowledged_seq:
-            return
-        self._messages[seq] = _Retained(payload, now_ns, now_ns)
-        self.retained_bytes += len(payload)
-        while len(self._messages) > 1 and self._over_limit(now_ns):
-            self._drop_oldest()
-            self.given_up += 1
-
-    def acknowledge(self, next_seq: int) -> None:
-        """Forget all messages before ``next_seq``; the last of them may be one that is not retained yet."""
-        # No later one can have arrived, whatever the receiver says.
-        self._acknowledged_seq = max(self._acknowledged_seq, min(next_seq, self.next_seq + 1))
-        while self._messages and self.oldest_seq < next_seq:
-            self._drop_oldest()
-
-    def due(self, ranges: Iterator[tuple[int, int]], now_ns: int) -> Iterator[bytes]:
-        """Payloads of the missing messages that may be sent again now."""
-        for start, end in ranges:
-            for seq in range(max(start, self.oldest_seq), min(end, self.next_seq)):
-                message = self._messages.get(seq)
-                if message and now_ns - message.last_sent_ns >= RESEND_AFTER_S * 1e9:
-                    message.last_sent_ns = now_ns
-                    yield message.payload
-
-    def _over_limit(self, now_ns: int) -> bool:
-        oldest = next(iter(self._messages.values()))
-        return self.retained_bytes > self._max_bytes or now_ns - oldest.first_sent_ns > self._max_age_ns
-
-    def _drop_oldest(self) -> None:
-        _, message = self._messages.popitem(last=False)
-        self.retained_bytes -= len(message.payload)
 
 
 class OrderedReceiver(Generic[Item]):
@@ -183,12 +113,15 @@ class OrderedReceiver(Generic[Item]):
             return None
         missing: list[tuple[int, int]] = []
         start = self._next_seq
-        for seq in [*sorted(self._waiting), self._end_seq]:
+        waiting = sorted(self._waiting)
+        for seq in [*waiting, self._end_seq]:
             if seq > start:
                 missing.append((start, seq))
             start = seq + 1
             if len(missing) == MAX_RANGES:
                 break
+        if waiting:
+            missing.append((waiting[-1] + 1, waiting[-1] + 1))  # misses nothing, but tells what the newest is
         ranges = np.array(missing, dtype=np.int64).reshape(-1, 2)
         return Acknowledgement(self.stream, self._taken_seq, ranges, updates_owed)
 
@@ -237,7 +170,9 @@ class JournalSender:
     ) -> None:
         self._clock = clock or SystemClock()
         self._incarnation = incarnation
-        self._retained = RetainedMessages(round(settings.journal_s * 1e9), settings.journal_mib << 20)
+        self._retained = RetainedMessages(
+            round(settings.journal_s * 1e9), settings.journal_mib << 20, one_connection=topic.lane is resent.lane
+        )
         self._bytes_per_s = settings.resend_kib_per_s * 1024
         self._publisher = transport.publisher(topic)
         self._resent_publisher = transport.publisher(resent)
@@ -328,7 +263,7 @@ class JournalSender:
 
     def _take(self, acknowledgement: Acknowledgement, newest: bool) -> None:
         with self._lock:
-            self._retained.acknowledge(acknowledgement.next_seq)
+            self._retained.acknowledge(acknowledgement.next_seq, acknowledgement.missing, self._clock.now_ns())
         if self._on_acknowledgement:
             self._on_acknowledgement(acknowledgement)
         if newest:

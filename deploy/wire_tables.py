@@ -19,6 +19,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 import common.clock_exchange
 import common.frame_encoding
 import common.journal
+import common.retained_messages
 import common.messages
 import common.service
 import common.transport
@@ -90,8 +91,8 @@ CONSTANTS = (
     (common.clock_exchange, "EXCHANGE_S"),
     (common.clock_exchange, "EXCHANGE_TIMEOUT_S"),
     (common.journal, "HEAD_PERIOD_S"),
-    (common.journal, "RESEND_AFTER_S"),
-    (common.journal, "MAX_RANGES"),
+    (common.retained_messages, "LEAST_TIMEOUT_S"),
+    (common.retained_messages, "MAX_RANGES"),
     (services.actor.forwarding, "ACKNOWLEDGE_S"),
     (services.replay.replay, "ACKNOWLEDGE_S"),
     (services.replay.minibatch_senders, "LOST_AFTER_S"),

@@ -14,142 +14,15 @@ from common import topics
 from common.clock import FakeClock
 from common.codec import decode, encode
 from common.errors import TransportError
-from common.journal import HEAD_PERIOD_S, MAX_RANGES, RESEND_AFTER_S, JournalSender, OrderedReceiver, RetainedMessages
+from common.journal import HEAD_PERIOD_S, JournalSender, OrderedReceiver
 from common.messages import Acknowledgement, StreamHead
+from common.retained_messages import LEAST_TIMEOUT_S, MAX_RANGES, RetainedMessages
 from common.run_settings import JournalSettings
 from common.transport import InMemoryNetwork
 from tests.helpers import TIMEOUT_S, eventually, make_run
 
 S = 1_000_000_000
 MS = 1_000_000
-
-
-# ------------------------------------------------------------------ the sender holds
-
-
-def retained(count=0, max_age_s=60.0, max_bytes=10_000, size=10, every_s=1.0):
-    """Return a store of ``count`` messages, message i retained at i * ``every_s``."""
-    messages = RetainedMessages(round(max_age_s * S), max_bytes)
-    for seq in range(count):
-        messages.retain(seq, bytes([seq % 256]) * size, round(seq * every_s * S))
-    return messages
-
-
-def sent_again(messages, *ranges, at_s):
-    """Return the first bytes of what is due."""
-    return [payload[0] for payload in messages.due(iter(ranges), round(at_s * S))]
-
-
-def test_an_empty_store_holds_nothing_from_the_next_number_on():
-    messages = retained()
-    assert (len(messages), messages.oldest_seq, messages.next_seq, messages.retained_bytes) == (0, 0, 0, 0)
-
-
-def test_what_was_sent_is_held():
-    messages = retained(3)
-    assert (len(messages), messages.oldest_seq, messages.next_seq, messages.retained_bytes) == (3, 0, 3, 30)
-
-
-@pytest.mark.parametrize("seq", [0, 1, 3, 4])
-def test_numbers_are_contiguous(seq):
-    messages = retained(2)
-    with pytest.raises(ValueError, match=f"seq: expected 2, got {seq}"):
-        messages.retain(seq, b"x", 0)
-    assert len(messages) == 2
-
-
-def test_an_acknowledgement_frees_all_before_it():
-    messages = retained(5)
-    messages.acknowledge(3)
-    assert (len(messages), messages.oldest_seq, messages.next_seq, messages.retained_bytes) == (2, 3, 5, 20)
-    assert messages.given_up == 0
-
-
-@pytest.mark.parametrize("next_seq", [0, 2, 3])
-def test_an_old_acknowledgement_changes_nothing(next_seq):
-    messages = retained(5)
-    messages.acknowledge(3)
-    messages.acknowledge(next_seq)
-    assert (messages.oldest_seq, messages.given_up) == (3, 0)
-
-
-def test_an_acknowledgement_of_more_than_was_sent_frees_all():
-    messages = retained(5)
-    messages.acknowledge(2**62)
-    assert (len(messages), messages.oldest_seq, messages.next_seq) == (0, 5, 5)
-
-
-def test_a_message_that_is_acknowledged_before_it_is_retained_is_not_held():
-    messages = retained(3)
-    messages.acknowledge(4)  # number 3 is on its way
-    messages.retain(3, b"d", 0)
-    assert (messages.oldest_seq, messages.next_seq, len(messages), messages.retained_bytes) == (4, 4, 0, 0)
-
-
-def test_what_is_sent_after_an_acknowledgement_of_more_than_there_can_be_is_held():
-    messages = retained(3)
-    messages.acknowledge(100)
-    for seq in (3, 4, 5):
-        messages.retain(seq, b"x", 0)
-    assert (messages.oldest_seq, messages.next_seq, len(messages)) == (4, 6, 2)
-
-
-def test_messages_older_than_the_limit_are_given_up():
-    messages = retained(5, max_age_s=3.0)  # at 4 s, message 0 is 4 s old and message 1 just 3 s
-    assert (messages.oldest_seq, messages.given_up) == (1, 1)
-    messages.retain(5, b"x", 8 * S + 1)  # messages 1 to 4 are older than 3 s; 5 s after the fourth
-    assert (messages.oldest_seq, messages.given_up, len(messages)) == (5, 5, 1)
-
-
-def test_messages_beyond_the_memory_limit_are_given_up_oldest_first():
-    messages = retained(10, max_bytes=35)
-    assert (messages.oldest_seq, messages.given_up, messages.retained_bytes) == (7, 7, 30)
-
-
-def test_the_memory_limit_itself_is_allowed():
-    assert retained(3, max_bytes=30).given_up == 0
-
-
-def test_the_newest_message_is_held_however_large_it_is():
-    messages = retained(3)
-    messages.retain(3, b"x" * 20_000, 3 * S)
-    assert (len(messages), messages.oldest_seq, messages.given_up, messages.retained_bytes) == (1, 3, 3, 20_000)
-
-
-def test_a_message_is_not_sent_again_while_it_may_be_on_its_way():
-    messages = retained(1)
-    assert sent_again(messages, (0, 1), at_s=RESEND_AFTER_S - 1e-9) == []
-    assert sent_again(messages, (0, 1), at_s=RESEND_AFTER_S) == [0]
-    assert sent_again(messages, (0, 1), at_s=2 * RESEND_AFTER_S - 1e-9) == []
-    assert sent_again(messages, (0, 1), at_s=2 * RESEND_AFTER_S) == [0]
-
-
-def test_only_what_is_missing_is_sent_again_in_order():
-    messages = retained(10, every_s=0)
-    assert sent_again(messages, (1, 3), (5, 6), (8, 10), at_s=1) == [1, 2, 5, 8, 9]
-
-
-def test_what_is_not_held_is_not_sent_again():
-    messages = retained(10, every_s=0)
-    messages.acknowledge(4)
-    assert sent_again(messages, (0, 6), (9, 1000), at_s=1) == [4, 5, 9]
-
-
-@pytest.mark.parametrize("ranges", [[], [(3, 3)], [(5, 2)], [(-5, 0)], [(10, 20)], [(2**62, 2**62 + 5)]])
-def test_ranges_that_ask_for_nothing_get_nothing(ranges):
-    assert sent_again(retained(10, every_s=0), *ranges, at_s=1) == []
-
-
-def test_overlapping_ranges_send_a_message_once():
-    assert sent_again(retained(4, every_s=0), (0, 3), (1, 4), (0, 4), at_s=1) == [0, 1, 2, 3]
-
-
-def test_an_acknowledgement_while_resending_ends_it():
-    messages = retained(5, every_s=0)
-    due = messages.due(iter([(0, 5)]), S)
-    assert next(due)[0] == 0
-    messages.acknowledge(4)
-    assert [payload[0] for payload in due] == [4]
 
 
 # ------------------------------------------------------------------ the receiver orders
@@ -170,7 +43,8 @@ def taken(receiver):
 
 
 def missing(receiver):
-    return receiver.acknowledgement().missing.tolist()
+    """Return the gaps that the acknowledgement names."""
+    return [[start, end] for start, end in receiver.acknowledgement().missing.tolist() if start < end]
 
 
 def counts(receiver):
@@ -228,9 +102,18 @@ def test_gaps_are_reported_as_half_open_ranges():
     acknowledgement = receiver.acknowledgement(updates_owed=2.5)
     assert acknowledgement.stream == 1
     assert acknowledgement.next_seq == 2
-    assert acknowledgement.missing.tolist() == [[2, 4], [5, 6], [8, 9]]
+    assert acknowledgement.missing.tolist() == [[2, 4], [5, 6], [8, 9], [10, 10]]
     assert acknowledgement.missing.dtype == np.int64
     assert acknowledgement.updates_owed == 2.5
+
+
+def test_behind_the_gaps_an_empty_range_tells_what_the_newest_is():
+    receiver = received(0, 2, 3, 7)
+    assert receiver.acknowledgement().missing.tolist() == [[1, 2], [4, 7], [8, 8]]
+    received(1, receiver=receiver)
+    assert receiver.acknowledgement().missing.tolist() == [[4, 7], [8, 8]]
+    received(4, 5, 6, receiver=receiver)
+    assert receiver.acknowledgement().missing.tolist() == []
 
 
 def test_without_gaps_nothing_is_reported_missing():
@@ -264,7 +147,7 @@ def test_a_late_receiver_begins_where_the_sender_still_has_something():
     receiver = received(57, head=(50, 58))
     assert taken(receiver) == []
     acknowledgement = receiver.acknowledgement()
-    assert (acknowledgement.next_seq, acknowledgement.missing.tolist()) == (50, [[50, 57]])
+    assert (acknowledgement.next_seq, acknowledgement.missing.tolist()) == (50, [[50, 57], [58, 58]])
     received(*range(50, 57), receiver=receiver)
     assert taken(receiver) == list(range(50, 58))
     assert counts(receiver) == (0, 0, 0)  # what was before 50 had been acknowledged
@@ -420,7 +303,7 @@ class LossyWay:
 def test_every_message_is_handed_on_in_order_or_counted_as_lost(seed, max_bytes):
     rng = random.Random(seed)
     loss = rng.choice([0.0, 0.1, 0.4, 0.8])
-    sender, receiver = RetainedMessages(10**18, max_bytes), OrderedReceiver()
+    sender, receiver = RetainedMessages(10**18, max_bytes, one_connection=True), OrderedReceiver()
     data, heads, acknowledgements = (LossyWay(rng, loss) for _ in range(3))
     receiver.note_head(StreamHead(1, 0, 0))
     handed_on, now_ns = [], 0
@@ -442,15 +325,17 @@ def test_every_message_is_handed_on_in_order_or_counted_as_lost(seed, max_bytes)
             receiver.note_head(head)
         acknowledgements.put(receiver.acknowledgement())
         for acknowledgement in acknowledgements.take():
-            sender.acknowledge(acknowledgement.next_seq)
+            sender.acknowledge(acknowledgement.next_seq, acknowledgement.missing, now_ns)
             for payload in sender.due(iter(acknowledgement.missing.tolist()), now_ns):
                 data.put(int.from_bytes(payload, "big"))
-    for _ in range(3 * 300 // MAX_RANGES):  # the end: nothing is lost on the way any more
-        now_ns += S
+    for _ in range(300):  # the end: nothing is lost on the way any more, and every time-out passes
+        now_ns += 1000 * S
         receiver.note_head(StreamHead(1, sender.oldest_seq, sender.next_seq))
         acknowledgement = receiver.acknowledgement()
+        sender.acknowledge(acknowledgement.next_seq, acknowledgement.missing, now_ns)
         receive(int.from_bytes(p, "big") for p in sender.due(iter(acknowledgement.missing.tolist()), now_ns))
-        sender.acknowledge(receiver.acknowledgement().next_seq)
+    last = receiver.acknowledgement()
+    sender.acknowledge(last.next_seq, last.missing, now_ns)
 
     assert handed_on == sorted(set(handed_on))
     assert len(handed_on) + receiver.lost == sender.next_seq
@@ -520,7 +405,7 @@ def repair(sender, other, clock):
     """Let time pass and acknowledgements flow until the sender holds nothing any more."""
 
     def done():
-        clock.advance(RESEND_AFTER_S)
+        clock.advance(LEAST_TIMEOUT_S)
         sender.send_head()
         other.acknowledge()
         return sender.unacknowledged == 0
@@ -720,8 +605,8 @@ def test_an_acknowledgement_of_impossible_ranges_does_no_harm(clock, started):
     put(sender, 4)
     clock.advance(1)
     limits = np.iinfo(np.int64)
-    other.send(encode(Acknowledgement(1, 0, np.array([[limits.min, limits.max], [3, 1]]), 0.0)))
-    eventually(lambda: sender.resent == 4)
+    other.send(encode(Acknowledgement(1, 0, np.array([[limits.min, limits.max], [3, 1], [4, 4]]), 0.0)))
+    eventually(lambda: sender.resent == 3)  # number 3 has come, says the empty range
     other.acknowledge()
     eventually(lambda: sender.unacknowledged == 0)
 
@@ -733,7 +618,7 @@ def test_repairs_go_on_a_topic_of_their_own(clock, started):
     sender = started(make_sender(network, clock))
     put(sender, 3)
     clock.advance(1)
-    ReceivingSide(network).send(encode(Acknowledgement(1, 1, np.array([[1, 2]]), 0.0)))
+    ReceivingSide(network).send(encode(Acknowledgement(1, 1, np.array([[1, 2], [3, 3]]), 0.0)))
     assert resent.get(timeout=TIMEOUT_S) == b"1:1"
     eventually(lambda: sender.resent == 1)
     assert resent.empty()
@@ -759,7 +644,7 @@ def test_stopping_does_not_wait_for_slow_repairs(clock):
     for seq in range(3):
         sender.put(seq, b"x" * 10_000)
     clock.advance(1)
-    ReceivingSide(network).send(encode(Acknowledgement(1, 0, np.array([[0, 3]]), 0.0)))
+    ReceivingSide(network).send(encode(Acknowledgement(1, 0, np.array([[0, 2], [3, 3]]), 0.0)))
     resent.get(timeout=TIMEOUT_S)
     stopper = threading.Thread(target=sender.stop)
     stopper.start()
