@@ -106,9 +106,15 @@ class RetainedMessages:
         self._order = -1
         self._arrived_order = [-1, -1]
         """Newest sending that is known to have arrived, of first ones and of repairs if those travel apart."""
+        self._news_ns = [0, 0]
+        """When that was heard."""
         self._newest_sent_ns = 0
         """When the newest sending that has arrived had left, of first ones."""
         self._time = AcknowledgedTime()
+        self._heard_ns = 0
+        """When the last acknowledgement came."""
+        self._before_silence = -1
+        """Newest sending before the acknowledgements last fell silent: its time would measure an outage."""
         self._window: RepairWindow | None = None
         """None while nothing is missing: what was known of the network link is old then."""
         self._in_flight: dict[int, _Retained] = {}
@@ -154,19 +160,22 @@ class RetainedMessages:
         self._acknowledged_seq = max(self._acknowledged_seq, min(next_seq, self.next_seq + 1))
         ranges = [(int(start), int(end)) for start, end in missing]
         newest = self._arrived_order[0]
+        if now_ns - self._heard_ns > self._time.timeout_ns:
+            self._before_silence = self._order
+        self._heard_ns = now_ns
         while self._messages and self.oldest_seq < next_seq:
             seq = self.oldest_seq
-            self._note_arrival(seq, self._messages[seq])
+            self._note_arrival(seq, self._messages[seq], now_ns)
             self._drop_oldest()
         for seq in self._arrived_repairs(ranges):
-            self._note_arrival(seq, self._messages[seq])
+            self._note_arrival(seq, self._messages[seq], now_ns)
         # What is before a gap, or before the empty range that tells of the newest, has arrived.
         for start, _ in reversed(ranges):
             message = self._messages.get(start - 1)
             if message and not message.repairs:
-                self._note_arrival(start - 1, message)
+                self._note_arrival(start - 1, message, now_ns)
                 break
-        if self._arrived_order[0] > newest:
+        if self._arrived_order[0] > max(newest, self._before_silence):
             self._time.measure(now_ns - self._newest_sent_ns)
         self._find_lost_repairs(now_ns)
         if not ranges and not self._in_flight:
@@ -210,12 +219,13 @@ class RetainedMessages:
                 arrived.append(seq)
         return arrived
 
-    def _note_arrival(self, seq: int, message: _Retained) -> None:
+    def _note_arrival(self, seq: int, message: _Retained, now_ns: int) -> None:
         if self._take_from_flight(seq) and self._window:
             self._window.arrived(len(message.payload))
-        path = self._repairs_path if message.repairs else 0
+        path = self._path(message)
         if not message.ambiguous and message.order > self._arrived_order[path]:
             self._arrived_order[path] = message.order
+            self._news_ns[path] = now_ns
             if path == 0:
                 self._newest_sent_ns = message.last_sent_ns
 
@@ -229,7 +239,12 @@ class RetainedMessages:
                     self._window.lost(len(message.payload), message.order, self._order)
 
     def _is_overdue(self, message: _Retained, now_ns: int) -> bool:
-        return now_ns - message.last_sent_ns >= self._time.timeout_ns << min(message.repairs, MAX_DOUBLINGS)
+        # While later and later ones arrive, what is behind them is late, however long it takes (RFC 6298, 5.3).
+        since_ns = max(message.last_sent_ns, self._news_ns[self._path(message)])
+        return now_ns - since_ns >= self._time.timeout_ns << min(message.repairs, MAX_DOUBLINGS)
+
+    def _path(self, message: _Retained) -> int:
+        return self._repairs_path if message.repairs else 0
 
     def _take_from_flight(self, seq: int) -> bool:
         """Return whether it was on its way."""

@@ -19,8 +19,8 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 import common.clock_exchange
 import common.frame_encoding
 import common.journal
-import common.retained_messages
 import common.messages
+import common.retained_messages
 import common.service
 import common.transport
 import services.actor.forwarding

@@ -168,15 +168,24 @@ def test_the_time_out_doubles_with_each_repair():
     assert sent == [1, 3, 7, 15, 31, 47, 63, 79, 95]  # after 1, 2, 4, 8, 16 s, and not less often
 
 
-def test_the_time_out_is_measured():
-    messages = retained(2, every_s=0)
-    assert answer(messages, 1, (1, 2), at_s=1.9) == []  # 1.9 + 4 * 0.95 = 5.7 s
-    assert answer(messages, 1, (1, 2), at_s=5.7 - 1e-9) == []
-    assert answer(messages, 1, (1, 2), at_s=5.7) == [1]
+def test_the_time_out_is_measured_and_begins_anew_with_each_news():
     messages = retained(3, every_s=0)
-    messages.acknowledge(1, NOTHING, round(0.2 * S))  # 0.2 + 4 * 0.1 = 0.6 s
-    assert answer(messages, 1, (1, 3), at_s=0.6 - 1e-9) == []
-    assert answer(messages, 1, (1, 3), at_s=0.6) == [1]
+    messages.acknowledge(1, NOTHING, round(0.2 * S))  # measured: 0.2 + 4 * 0.1 = 0.6 s
+    assert answer(messages, 1, (1, 3), at_s=0.8 - 1e-9) == []
+    assert answer(messages, 1, (1, 3), at_s=0.8) == [1]
+
+
+def test_what_is_late_is_not_sent_again_however_late_while_others_arrive():
+    messages = retained(100, every_s=0)
+    assert [answer(messages, seq, (seq, 100), at_s=seq / 4) for seq in range(1, 100)] == [[]] * 99
+
+
+def test_an_outage_is_not_taken_for_the_time_that_messages_take():
+    messages = retained(3, every_s=0)
+    messages.acknowledge(1, NOTHING, round(0.1 * S))  # 0.1 + 4 * 0.05 = 0.3, at least 0.5 s
+    messages.acknowledge(2, NOTHING, 10 * S)  # sent before 9.9 s of silence
+    assert answer(messages, 2, (2, 3), at_s=10.5 - 1e-9) == []
+    assert answer(messages, 2, (2, 3), at_s=10.5) == [2]
 
 
 def test_what_may_have_come_in_two_ways_overtakes_nothing():
