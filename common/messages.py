@@ -284,7 +284,8 @@ class Acknowledgement:
     next_seq: Count
     """All before this number have been taken over by the receiver."""
     missing: Annotated[Int64Array, Array("int64", ("n", 2))]
-    """Half-open ranges [start, end) that are known to exist and have not arrived."""
+    """Half-open ranges [start, end) that are known to exist and have not arrived; an empty one at the end, [n, n),
+    tells that n - 1 is the newest that has."""
     updates_owed: Annotated[float, Bounds(low=0.0)]
     """What the learner has still to do: unspent updates, or on-policy the transitions of a rollout that it has not
     answered with a new policy; in lockstep the actor waits for it. 0 on other streams."""

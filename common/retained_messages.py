@@ -4,7 +4,7 @@ Two questions are TCP's, and so are the answers; time is told, and no thread is 
 
 *Is it lost, or only late?* A connection keeps order. So a message is lost once one that was sent after it has arrived
 (RFC 8985, RACK). Where nothing arrives any more, it counts as lost after the time that acknowledgements take, with room
-for their variation (RFC 6298), doubled with each repair of it.
+for their variation (RFC 6298), doubled with each repair of it. That is only a guess, so one message is tried first.
 
 *How much may be on its way?* A window of repairs that have been sent and are neither acknowledged nor lost. It grows
 with each that arrives and halves when one is lost (RFC 5681), so repairs adapt to what the network link leaves them;

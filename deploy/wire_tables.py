@@ -92,6 +92,7 @@ CONSTANTS = (
     (common.clock_exchange, "EXCHANGE_TIMEOUT_S"),
     (common.journal, "HEAD_PERIOD_S"),
     (common.retained_messages, "LEAST_TIMEOUT_S"),
+    (common.retained_messages, "INITIAL_WINDOW_BYTES"),
     (common.retained_messages, "MAX_RANGES"),
     (services.actor.forwarding, "ACKNOWLEDGE_S"),
     (services.replay.replay, "ACKNOWLEDGE_S"),

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import pytest
 
+from common.journal import OrderedReceiver
+from common.messages import StreamHead
 from common.retained_messages import AcknowledgedTime, RepairWindow, RetainedMessages
 
 S = 1_000_000_000
@@ -320,3 +324,116 @@ def test_a_full_list_of_gaps_says_nothing_of_what_is_behind_it():
     assert answer(messages, 1, *odd[:-1], (131, 131), at_s=0.2) == []
     send(messages, 1, size=3000, at_s=0.3)
     assert 129 in answer(messages, 127, (127, 128), (129, 130), (132, 132), at_s=0.4)
+
+
+# ------------------------------------------------------------------ over a way that is narrow, or broken for a while
+
+TICK_MS = 20
+SIZE = 6000
+EVERY_TICKS = 2
+"""A message each 40 ms: 150 kB/s."""
+ANSWER_TICKS = 5
+BUFFER_BYTES = 320 * 1024
+
+
+class Narrow:
+    """A stream over a connection that carries so many bytes a second, and drops what finds its buffer full."""
+
+    def __init__(self, bytes_per_s, one_connection=True):
+        self.sender = RetainedMessages(1000 * S, 10**9, one_connection=one_connection)
+        self.receiver = OrderedReceiver()
+        self.bytes_per_s = bytes_per_s
+        self.ticks = self.fresh = self.resent = self.dropped = 0
+        self._buffer = deque()
+        self._credit = 0.0
+
+    def run(self, seconds, silent=False, fresh=True):
+        """Go on for a while; return when it was known that nothing is missing any more, in seconds, or None."""
+        complete = None
+        for tick in range(round(seconds * 1000 / TICK_MS)):
+            self.ticks += 1
+            now_ns = self.ticks * TICK_MS * MS
+            if fresh and self.ticks % EVERY_TICKS == 0:
+                self._put(self.fresh)
+                self.sender.retain(self.fresh, self.fresh.to_bytes(2, "big") + bytes(SIZE - 2), now_ns)
+                self.fresh += 1
+            if silent:
+                continue
+            self._carry()
+            if self.ticks % ANSWER_TICKS == 0:
+                self._answer(now_ns)
+                if complete is None and self.receiver.received_all:
+                    complete = tick * TICK_MS / 1000
+        return complete
+
+    def _put(self, seq):
+        if SIZE * (len(self._buffer) + 1) > BUFFER_BYTES:
+            self.dropped += 1
+        else:
+            self._buffer.append(seq)
+
+    def _carry(self):
+        self._credit = min(self._credit + self.bytes_per_s * TICK_MS / 1000, self.bytes_per_s)
+        while self._buffer and self._credit >= SIZE:
+            self._credit -= SIZE
+            seq = self._buffer.popleft()
+            self.receiver.accept(1, seq, seq)
+
+    def _answer(self, now_ns):
+        self.receiver.note_head(StreamHead(1, self.sender.oldest_seq, self.sender.next_seq))
+        self.receiver.take_ready()
+        acknowledgement = self.receiver.acknowledgement()
+        self.sender.acknowledge(acknowledgement.next_seq, acknowledgement.missing, now_ns)
+        for payload in self.sender.due(iter(acknowledgement.missing.tolist()), now_ns):
+            self.resent += 1
+            self._put(int.from_bytes(payload[:2], "big"))
+
+
+@pytest.mark.parametrize("one_connection", [True, False])
+def test_a_way_that_just_carries_the_stream_sees_no_repairs_however_full_it_is(one_connection):
+    way = Narrow(150_000, one_connection)
+    way.run(1)
+    way.run(2, silent=True)  # 50 messages wait from now on: 2 s, far more than was measured before
+    way.run(60)
+    assert (way.dropped, way.resent, way.receiver.duplicates) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("one_connection", [True, False])
+def test_too_narrow_a_way_sees_no_storm_and_in_the_end_everything_comes(one_connection):
+    """120 of 150 kB/s, for two minutes."""
+    way = Narrow(120_000, one_connection)
+    way.run(120)
+    assert way.dropped > 0.1 * way.fresh  # 20 % at least, less what the buffer still holds and the first seconds
+    assert way.resent < 0.25 * way.fresh
+    assert way.run(60, fresh=False) is not None
+    assert way.receiver.duplicates <= 3
+    assert len(way.sender) == 0
+
+
+def test_an_outage_on_a_wide_way_is_repaired_within_a_few_acknowledgements():
+    """Of 250 messages of 6 kB the buffer holds 54 and 196 are lost, besides repairs that come in too large a burst."""
+    way = Narrow(10_000_000)
+    way.run(5)
+    way.run(10, silent=True)
+    recovered = way.run(5)
+    assert recovered <= 1.0
+    assert 196 <= way.dropped <= 300
+    assert (way.resent, way.receiver.duplicates) == (way.dropped, 0)
+
+
+def test_an_outage_at_the_end_of_a_stream_is_repaired_too():
+    """Nothing new overtakes what was lost: it is found by the time-out, and one message at first is tried."""
+    way = Narrow(10_000_000)
+    way.run(5)
+    way.run(10, silent=True)
+    assert way.run(5, fresh=False) <= 3.0
+    assert (way.resent, way.receiver.duplicates) == (way.dropped, 0)
+
+
+def test_repairs_of_a_way_with_little_to_spare_come_in_time_and_once():
+    """170 kB/s, and 5 s of outage: 72 messages (432 kB) are lost, and 20 kB/s are left for them."""
+    way = Narrow(170_000)
+    way.run(5)
+    way.run(5, silent=True)
+    assert way.run(120) <= 60
+    assert way.receiver.duplicates == 0

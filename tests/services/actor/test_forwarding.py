@@ -9,6 +9,7 @@ from common import topics
 from common.clock import FakeClock
 from common.codec import encode
 from common.messages import Acknowledgement, Experience, PolicyExtras, StreamHead
+from common.retained_messages import FIRST_TIMEOUT_S
 from common.transport import InMemoryNetwork
 from services.actor import forwarding
 from services.actor.config import ActorSettings
@@ -120,7 +121,7 @@ def test_answers_are_remembered_long_enough_and_not_for_ever(line):
 def test_a_gap_holds_back_what_comes_after_it_until_it_is_filled(line):
     line.send_head(0)
     line.add(0, 1, 4, 3)
-    line.wait_for_ack(2, [(2, 3)])
+    line.wait_for_ack(2, [(2, 3), (5, 5)])
     assert len(line.experiences) == 2
     line.add(2)
     assert [e.time_step.seq for e in line.experiences.wait_for(5)] == [0, 1, 2, 3, 4]
@@ -154,7 +155,7 @@ def test_a_copy_is_forwarded_once(line):
 def test_an_actor_that_comes_late_begins_where_the_bridge_still_has_something(line):
     line.add(41, 42)
     line.send_head(43, oldest_seq=40)
-    line.wait_for_ack(40, [(40, 41)])
+    line.wait_for_ack(40, [(40, 41), (43, 43)])
     line.add(40)
     assert [e.time_step.seq for e in line.experiences.wait_for(3)] == [40, 41, 42]
     assert line.forwarder.counters()["lost"] == 0
@@ -193,7 +194,9 @@ def test_replay_gets_again_what_it_misses(tmp_path):
     line.forwarder.start()
     line.add(0, 1, 2)
     eventually(lambda: line.forwarder.counters()["unacknowledged"] == 3)
-    clock.advance(0.6)
+    line.acknowledge(2, missing=[(2, 3)])
+    eventually(lambda: line.forwarder.counters()["unacknowledged"] == 1)
+    clock.advance(FIRST_TIMEOUT_S)
     line.acknowledge(2, missing=[(2, 3)])
     assert line.resent.wait_for(1)[0].seq == 2
     eventually(lambda: line.forwarder.counters()["resent"] == 1)

@@ -106,10 +106,10 @@ def test_what_comes_after_a_gap_waits_and_the_gap_is_named(scene, tmp_path):
     scene.send(*(experiences[i] for i in (0, 1, 4, 7, 5)))
     assert scene.counter("rows") == 2
     ack = scene.ack()
-    assert (ack.next_seq, ack.missing.tolist()) == (2, [[2, 4], [6, 7]])
+    assert (ack.next_seq, ack.missing.tolist()) == (2, [[2, 4], [6, 7], [8, 8]])
     scene.send(experiences[3], experiences[2], topic=topics.EXPERIENCE_RESENT)
     ack = scene.ack()
-    assert (ack.next_seq, ack.missing.tolist()) == (6, [[6, 7]])
+    assert (ack.next_seq, ack.missing.tolist()) == (6, [[6, 7], [8, 8]])
     scene.send(experiences[6])
     assert scene.counter("transitions") == 7  # in order: no pair is missing
     seqs = RingReader(tmp_path / RING_FILE).read_rows(np.arange(8))["seq"]
@@ -137,7 +137,7 @@ def test_what_the_actor_gave_up_is_lost_and_counted_and_no_pair_is_made_across_i
     scene.send(*experiences[:2], *experiences[5:])
     scene.send_head(8, oldest_seq=4)
     assert scene.counter("lost") == 2
-    assert scene.ack().missing.tolist() == [[4, 5]]
+    assert scene.ack().missing.tolist() == [[4, 5], [8, 8]]
     scene.send(experiences[4])
     assert scene.counter("rows") == 6
     assert scene.replay.details()["produced_seen"] == {"1": 8}
