@@ -82,4 +82,4 @@ class JournalSettings:
     journal_mib: int = setting(512, low=1, high=65536)
     """Memory that unacknowledged messages may take, MiB; the oldest are given up first."""
     resend_kib_per_s: float = setting(8192.0, low=1.0)
-    """Pace at which gaps are resent, KiB/s: the share of the network link that repairs may take."""
+    """Fastest pace at which gaps are resent, KiB/s: the most that repairs may take of the network link."""
