@@ -26,6 +26,9 @@ class Heard(Protocol):
     def news(self) -> News | None: ...
 
     @property
+    def has_record(self) -> bool: ...
+
+    @property
     def silent_s(self) -> float: ...
 
 
@@ -56,7 +59,9 @@ class Listener:
         if news is None or self._ended_s is None:
             return None
         there, since_s = self._other.there, self._now_s() - self._ended_s
-        if not self._run_has_begun():
+        # The news of a short run's end are faster than its record, which tells that it had begun.
+        knows = self._robot_is_here or self._other.has_record or since_s > INTERRUPTED_S
+        if knows and not self._run_has_begun():
             return EarlyEnd(f"{there} has ended before the run had begun, and so it ends here, too", not news.succeeded)
         limit_s = OVERTIME_S if news.succeeded else INTERRUPTED_S
         if not self._robot_is_here and since_s > limit_s:

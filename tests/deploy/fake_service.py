@@ -1,7 +1,8 @@
 """A stand-in for a service: ``fake_service.py NAME RUN_DIR BEHAVIOUR``. Only the standard library, so it starts fast.
 
-It writes a part, as services do, and lives until the bridge says that the run is over (the file ``finished``), or
-until a signal. What ends it is a line of ``ends.log``.
+It writes a part, as services do, and lives until the bridge says that the run is over (the file ``finished``; with
+``hears`` the mirrored part of a bridge on another computer does as well), or until a signal. What ends it is a line of
+``ends.log``.
 """
 
 import json
@@ -66,7 +67,16 @@ if behaviour == "crash":
     sys.exit("Traceback: something unexpected")
 if behaviour == "done":
     end("done")
+
+
+def bridge_has_stopped_there() -> bool:
+    parts = (run_dir / "hosts").glob("*/parts/robot_bridge-*.json")
+    return any(json.loads(part.read_text(encoding="utf-8"))["state"] == "stopped" for part in parts)
+
+
 while True:
     if behaviour != "deaf" and (run_dir / "finished").exists():
         end("finished")
+    if behaviour == "hears" and bridge_has_stopped_there():
+        end("heard")
     time.sleep(0.01)

@@ -20,6 +20,7 @@ class Scene:
     begun: bool = True
     there: Host = "remote"
     news: News | None = None
+    has_record: bool = False
     silent_s: float = 0.0
     now_s: float = 100.0
     out: io.StringIO = field(default_factory=io.StringIO)
@@ -102,14 +103,27 @@ def test_when_the_robot_s_side_has_ended_the_services_here_have_a_while_to_end_b
     assert "local ended" in end.reason
 
 
-@pytest.mark.parametrize("robot_is_here", [True, False])
-def test_who_ends_before_the_run_has_begun_ends_it_for_both(robot_is_here: bool) -> None:
-    scene = Scene(robot_is_here=robot_is_here, begun=False)
+@pytest.mark.parametrize(("robot_is_here", "has_record"), [(True, False), (False, True)])
+def test_who_ends_before_the_run_has_begun_ends_it_for_both(robot_is_here: bool, has_record: bool) -> None:
+    scene = Scene(robot_is_here=robot_is_here, begun=False, has_record=has_record)
     scene.hear(phase=ENDED, outcome="not well at the end: learner")
     end = scene.listener.early_end()
     assert end is not None
     assert end.is_failure
     assert "before the run had begun" in end.reason
+
+
+def test_whether_a_run_had_begun_there_is_judged_by_its_record_and_without_one_after_a_while() -> None:
+    scene = Scene(robot_is_here=False, there="local", begun=False)
+    scene.hear(phase=ENDED, outcome="well", succeeded=True)
+    assert not scene.ends()
+    scene.begun = scene.has_record = True
+    assert not scene.ends()
+    scene.begun = scene.has_record = False
+    scene.now_s += INTERRUPTED_S
+    assert not scene.ends()
+    scene.now_s += 0.1
+    assert scene.ends()
 
 
 def test_after_its_own_end_nobody_is_told_how_to_go_on() -> None:

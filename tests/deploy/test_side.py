@@ -87,7 +87,7 @@ def read_until(launcher: subprocess.Popen[str], stream: str, text: str) -> str:
 def test_each_side_starts_its_own_services_and_both_have_the_whole_record(computers: Computers) -> None:
     sides = {
         "local": computers.start("local", "--steps", "100", robot_bridge="done", actor="done"),
-        "remote": computers.start("remote", "--steps", "100", replay="done", learner="done"),
+        "remote": computers.start("remote", "--steps", "100", replay="hears", learner="hears"),
     }
     said = {host: finish(launcher) for host, launcher in sides.items()}
     own = {"local": ["robot_bridge", "actor"], "remote": ["replay", "learner"]}
