@@ -61,6 +61,8 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
         raise ConfigError(f"--run-dir {run_dir}: expected a folder that is empty or not there yet")
     is_new = not run_dir.exists()
     plan = plan_training(training)
+    if console:
+        console.line(f"run directory: {run_dir}")
     if stop:
         load_libraries(plan.configurations[LEARNER].algorithm.name, stop)
     plan = plan.with_computing_times()
@@ -170,7 +172,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def run() -> int:
         with StopSignals() as stop:
-            console.line(f"run directory: {training.run_dir}")
             train(training, console, stop)
         return INTERRUPTED if stop.asked else 0
 

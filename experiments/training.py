@@ -30,6 +30,7 @@ _NO_PORTS = PortMap(range(1, PORTS + 1))
 """The configurations want endpoints; nobody listens on them."""
 _ALONE = ("learner.nice=0",)
 """There is nobody here that a learner could keep from running."""
+_REAL_CAMERA = "opencv"
 _NOBODY_WAITS = ("robot_bridge.real_time_priority=false", "actor.real_time_priority=false")
 """In virtual time it does not matter when this process gets its processor."""
 
@@ -129,6 +130,7 @@ def plan_training(training: Training) -> PlannedTraining:
     )
     configurations = plan_run(request, _NO_PORTS, NoLink(), conditions)
     _check_pacing(configurations[ROBOT_BRIDGE].robot_bridge.pacing, pacing)
+    _check_camera(configurations[ROBOT_BRIDGE].camera.name)
     return PlannedTraining(configurations, placement, network, conditions, host, virtual)
 
 
@@ -156,4 +158,12 @@ def _check_pacing(pacing: str, expected: str) -> None:
         raise ConfigError(
             f"--set robot_bridge.pacing={pacing}: expected {expected!r}; a run is in lockstep without --mode, and in "
             "virtual time with it; for real time there is deploy.launch"
+        )
+
+
+def _check_camera(name: str) -> None:
+    if name == _REAL_CAMERA:
+        raise ConfigError(
+            f"--set camera.name={name}: its pictures are taken in real time, and time is simulated here; run it with "
+            "deploy.launch, or show a recording: camera.name=recorded"
         )

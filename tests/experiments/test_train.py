@@ -143,6 +143,7 @@ def test_a_stop_before_anything_is_begun_leaves_nothing(tmp_path, monkeypatch, c
         ({"overrides": ("algorithm.preset=none_such",)}, "none_such"),
         ({"host_budget": "jetsn"}, "did you mean 'jetson'"),
         ({"overrides": ("robot_bridge.pacing=realtime",)}, "lockstep"),
+        ({"mode": "local_only", "overrides": ("camera.name=opencv", "camera.device=0")}, "taken in real time"),
     ],
 )
 def test_what_cannot_be_trained_is_refused_with_the_reason(changes, message, tmp_path):
