@@ -22,6 +22,7 @@ import numpy as np
 import xxhash
 
 from common.messages import UInt8Array
+from common.native_code import compile_function
 
 _SECRET = bytes.fromhex(
     "b8fe6c3923a44bbe7c01812cf721ad1cded46de9839097db7240a4a4b7b3671fcb79e64eccc0e578825ad07dccff7221"
@@ -88,23 +89,9 @@ def load() -> Callable[[int, int, int, int, bool, Any], None]:
     stripe (every other stripe's is 8 bytes further on), whether each block ends with a scramble, and the state: eight
     accumulators, eight pairs of exponents.
     """
-    import llvmlite.binding as llvm
-
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    machine = llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=3
-    )
-    module = llvm.parse_assembly(_TAKE_IN)
-    passes = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=3))
-    passes.getModulePassManager().run(module, passes)
-    engine = llvm.create_mcjit_compiler(module, machine)
-    engine.finalize_object()
     address, integer = ctypes.c_void_p, ctypes.c_int64
     prototype = ctypes.CFUNCTYPE(None, address, integer, integer, integer, ctypes.c_bool, address)
-    function: Any = prototype(engine.get_function_address("take_in"))
-    function.engine = engine  # owns the code
-    return cast("Callable[[int, int, int, int, bool, Any], None]", function)
+    return cast("Callable[[int, int, int, int, bool, Any], None]", compile_function(_TAKE_IN, "take_in", prototype))
 
 
 def _all(number: int) -> str:

@@ -1,19 +1,39 @@
-"""Acting in NumPy: for a single observation twice as fast as torch, and torch need not be installed."""
+"""Acting in NumPy: for a single observation twice as fast as torch, and torch need not be installed.
+
+Wide networks without camera skip the units that are zero (:mod:`common.policies.sparse_layer`); they import LLVM.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from math import exp, log, log1p, pi, sqrt, tanh
 
 import numpy as np
 
 from common.messages import Float32Array, TaskSpec
 from common.policies.base import ChosenAction, Observation
+from common.policies.sparse_layer import SparseLayer, is_worthwhile
 from common.policies.unit_range import UnitRange, action_range, vector_range
 
 _LOG_2 = log(2.0)
 _LOG_DENSITY_OFFSET = log(sqrt(2.0 * pi)) + 2.0 * _LOG_2
 """What is subtracted from the log-density of each dimension whatever the draw."""
+
+Layer = Callable[[Float32Array], Float32Array]
+
+
+class DenseLayer:
+    """Bias + weight * inputs, for one vector of inputs."""
+
+    def __init__(self, weight: Float32Array, bias: Float32Array) -> None:
+        """Take over ``weight`` (outputs, inputs) and ``bias`` (outputs,)."""
+        self._weight, self._bias = weight, bias
+
+    def __call__(self, inputs: Float32Array) -> Float32Array:
+        """(inputs,) -> (outputs,)."""
+        result: Float32Array = self._weight.dot(inputs)
+        result += self._bias
+        return result
 
 
 class NumpyActor:
@@ -21,12 +41,17 @@ class NumpyActor:
 
     def __init__(self, spec: TaskSpec, parameters: Mapping[str, Float32Array]) -> None:
         """Take over ``parameters``, named and shaped as in :mod:`common.policies.weights`."""
-        layers = [(parameters[f"actor.{i}.weight"], parameters[f"actor.{i}.bias"]) for i in range(3)]
-        self._first, self._hidden, self._head = layers
+        first, hidden, head = ((parameters[f"actor.{i}.weight"], parameters[f"actor.{i}.bias"]) for i in range(3))
+        self._first: Layer = DenseLayer(*first)
+        self._hidden: Layer = DenseLayer(*hidden)
+        self._head: Layer = DenseLayer(*head)
         if not spec.has_camera:
             # Few columns: the other way round the product takes half the time. With the encoder's features there are
-            # so many that it saves less than turning them round takes.
-            self._first = (np.asfortranarray(layers[0][0]), layers[0][1])
+            # so many that it saves less than turning them round takes; and computing the features takes a hundred
+            # times what a sparse layer saves.
+            self._first = DenseLayer(np.asfortranarray(first[0]), first[1])
+            if is_worthwhile(len(hidden[0])):
+                self._hidden = SparseLayer(*hidden)
         low, high = parameters["log_std_bounds"].tolist()
         self._log_std_range = (low + high) / 2.0, (high - low) / 2.0
         self._actions = action_range(spec)
@@ -42,14 +67,10 @@ class NumpyActor:
         """Return an action for encoder features (64,), or None without camera, and the rest of the observation."""
         vector = self._vector.to_unit(np.concatenate([observation.proprioception, observation.previous_action]))
         hidden = vector if features is None else np.concatenate([features, vector])
-        for weight, bias in (self._first, self._hidden):
-            hidden = weight.dot(hidden)
-            hidden += bias
+        for layer in (self._first, self._hidden):
+            hidden = layer(hidden)
             np.maximum(hidden, 0.0, out=hidden)
-        weight, bias = self._head
-        head = weight.dot(hidden)
-        head += bias
-        return choose(head, self._log_std_range, self._actions, rng, deterministic)
+        return choose(self._head(hidden), self._log_std_range, self._actions, rng, deterministic)
 
 
 class NumpyPolicy:
