@@ -12,6 +12,7 @@ from common.networks.distribution import TanhGaussian
 from common.networks.encoder import Encoder
 from common.networks.mlp import Actor
 from common.policies import Observation, initial_policy, pack_weights, policy_from_weights
+from common.policies.sparse_layer import SparseLayer
 from common.policies.torch_policy import TorchPolicy
 from common.policies.unit_range import action_range, proprioception_range
 from common.policies.weights import initial_parameters
@@ -59,7 +60,7 @@ def torch_action(spec, parameters, observation, noise):
     parts.append(torch.from_numpy(proprioception_range(spec).to_unit(observation.proprioception))[None])
     parts.append(torch.from_numpy(action_range(spec).to_unit(observation.previous_action))[None])
     vector = torch.cat(parts, dim=1)
-    actor = Actor(vector.shape[1], 32, len(spec.action_low), **own)
+    actor = Actor(vector.shape[1], len(parameters["actor.0.bias"]), len(spec.action_low), **own)
     actor.load_state_dict({n[6:]: t for n, t in tensors.items() if n.startswith("actor.")})
     distribution = TanhGaussian.from_head(*actor(vector), -10.0, 10.0)
     action, log_probability = distribution.act(torch.from_numpy(noise)[None])
@@ -79,6 +80,41 @@ def test_a_policy_acts_as_the_learners_networks_do(spec):
         assert chosen.action.dtype == np.float32
         np.testing.assert_allclose(chosen.action, action, atol=1e-5)
         assert chosen.log_probability == pytest.approx(log_probability, abs=1e-4)
+
+
+# Without camera 512 and 1024 skip units that are zero; 520 does not, nor do those with camera.
+@pytest.mark.parametrize("hidden_size", [512, 520, 1024])
+@pytest.mark.parametrize("spec", SPECS, ids=IDS)
+@pytest.mark.parametrize("dtype", ["float32", "float16"])
+def test_a_wide_policy_acts_as_the_learners_networks_do(spec, hidden_size, dtype):
+    parameters, rng = random_parameters(spec, hidden_size=hidden_size), np.random.default_rng(3)
+    parameters = {name: values.astype(dtype).astype(np.float32) for name, values in parameters.items()}
+    policy = make_policy(spec, parameters, dtype, hidden_size)
+    for _ in range(5):
+        observation = make_observation(spec, rng)
+        chosen = policy.act(observation, rng, deterministic=True)
+        action, log_probability = torch_action(spec, parameters, observation, np.zeros(2, np.float32))
+        np.testing.assert_allclose(chosen.action, action, atol=1e-5)
+        assert chosen.log_probability == pytest.approx(log_probability, abs=1e-4)
+
+
+@pytest.mark.parametrize("hidden_size", [512, 1024])
+def test_a_wide_policy_without_camera_skips_units_that_are_zero(monkeypatch, hidden_size):
+    fetched = []
+
+    def noted(layer, inputs):
+        fetched.append(inputs)
+        return product(layer, inputs)
+
+    product = SparseLayer.__call__
+    monkeypatch.setattr(SparseLayer, "__call__", noted)
+    for spec, expected in zip(SPECS, (1, 0), strict=True):
+        fetched.clear()
+        policy = make_policy(spec, random_parameters(spec, hidden_size=hidden_size), hidden_size=hidden_size)
+        policy.act(make_observation(spec, np.random.default_rng(0)), np.random.default_rng(0))
+        assert len(fetched) == expected
+        for inputs in fetched:
+            assert 0.2 < (inputs == 0.0).mean() < 0.8
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=IDS)

@@ -28,7 +28,10 @@ weights = pack_weights(
 )
 action = policy_from_weights(spec, weights).act(observation, rng).action
 assert action.shape == (2,)
+initial_policy(spec, 256, (), seed=0).act(observation, rng)
 assert not {"llvmlite", "numba"} & set(sys.modules)
+initial_policy(spec, 512, (), seed=0)  # compiled now, not when the first policy comes
+assert "llvmlite" in sys.modules and "numba" not in sys.modules
 """
 
 
