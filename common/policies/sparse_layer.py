@@ -2,7 +2,7 @@
 
 After a ReLU about half of the units are zero, and a product with 1024 x 1024 weights takes as long as fetching them
 from the third-level cache does. So here they lie transposed, one contiguous row for each input, and rows of zero inputs
-are not fetched. NumPy has no such product; LLVM compiles the loop in .1 s when the first layer is made.
+are not fetched. NumPy has no such product; LLVM compiles the loop when the first layer is made, in .1 s.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ class SparseLayer:
         All must be finite, as a policy's are: the product of a zero input with an infinity is left out.
         """
         outputs, inputs = weight.shape
-        if outputs % _LANES or not inputs or bias.shape != (outputs,):
+        if outputs % _LANES or not weight.size or bias.shape != (outputs,):
             raise ValueError(
-                f"expected a multiple of {_LANES} outputs, at least one input, and as many biases as outputs; "
+                f"expected a multiple of {_LANES} outputs and at least one input, and as many biases as outputs; "
                 f"got weights {weight.shape}, biases {bias.shape}"
             )
         self._product = load()
@@ -72,11 +72,12 @@ def load() -> Callable[[int, int, int, int, int, int], None]:
     """Compile the product.
 
     Its arguments: addresses of the inputs, of the rows (inputs, outputs), of the bias and of the result, which is none
-    of the others; number of inputs, at least one, and of outputs, a multiple of 16. The rows begin at a multiple of 64
-    bytes.
+    of the others; number of inputs, at least one, and of outputs, a multiple of 16 but not zero. The rows begin at a
+    multiple of 64 bytes.
     """
     address, integer = ctypes.c_void_p, ctypes.c_int64
-    # Other threads wait: to give Python's lock away for 30 µs, and then to wait for it, may take 5 ms.
+    # It keeps Python's lock: to give that away for 26 µs means to wait for it afterwards, up to 5 ms. (m) Beside a
+    # thread busy with Python, 0 to .8 % of the calls take more than 1 ms, and 0 to 14 % if they give it away.
     prototype = ctypes.PYFUNCTYPE(None, address, address, address, address, integer, integer)
     return cast("Callable[[int, int, int, int, int, int], None]", compile_function(_PRODUCT, "product", prototype))
 

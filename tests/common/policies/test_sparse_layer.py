@@ -143,7 +143,7 @@ def test_no_byte_is_read_or_written_beyond_the_arrays(size):
                 np.testing.assert_array_equal(inside, before.reshape(-1))
 
 
-@pytest.mark.parametrize("shape", [(17, 100), (64, 0), (8, 100)], ids=str)
+@pytest.mark.parametrize("shape", [(17, 100), (64, 0), (0, 100), (8, 100)], ids=str)
 def test_sizes_that_the_loop_cannot_take_are_refused(shape):
     with pytest.raises(ValueError, match="16 outputs"):
         SparseLayer(np.zeros(shape, np.float32), np.zeros(shape[0], np.float32))
