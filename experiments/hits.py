@@ -17,6 +17,8 @@ from deploy.console import Console
 from experiments.command_line import exit_code
 from experiments.grid import GridRecord
 from experiments.target_hits.choice import (
+    MOST_SEEDS,
+    MOST_WORKERS,
     add_options,
     check_count,
     check_limits,
@@ -41,9 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _count(options: argparse.Namespace, console: Console) -> int:
     limits = check_limits(options.limits)
-    seeds = range(check_count("--seeds", options.seeds))
+    seeds = range(check_count("--seeds", options.seeds, MOST_SEEDS))
     steps = check_count("--steps", options.steps)
-    workers = check_count("--workers", options.workers)
+    workers = check_count("--workers", options.workers, MOST_WORKERS)
     choices = [choose_task(name, options.preset, options.set) for name in dict.fromkeys(options.task)]
     settings = record_settings(choices, steps=steps)
     return count_grid(

@@ -22,7 +22,15 @@ from common.record import write_atomically
 from deploy.console import Console
 from experiments.command_line import exit_code
 from experiments.grid import GridRecord
-from experiments.target_hits.choice import TaskChoice, check_count, choose_task, record_settings, usable_cores
+from experiments.target_hits.choice import (
+    MOST_SEEDS,
+    MOST_WORKERS,
+    TaskChoice,
+    check_count,
+    choose_task,
+    record_settings,
+    usable_cores,
+)
 from experiments.target_hits.counted_grid import count_grid
 from experiments.target_hits.counting import STEPS
 from experiments.target_hits.jobs import HitCount, hit_counts, hits_key
@@ -71,9 +79,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _count(options: argparse.Namespace, console: Console, table: Sequence[ThesisHits]) -> int:
-    seeds = range(check_count("--seeds", options.seeds))
+    seeds = range(check_count("--seeds", options.seeds, MOST_SEEDS))
     steps = check_count("--steps", options.steps)
-    workers = check_count("--workers", options.workers)
+    workers = check_count("--workers", options.workers, MOST_WORKERS)
     rows = chosen_rows(table, options.task)
     choices = {row.task: choose_task(row.task) for row in rows}
     limits = {row: limit_steps(row, choices[row.task]) for row in rows}

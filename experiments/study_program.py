@@ -13,7 +13,7 @@ from experiments.command_line import exit_code
 from experiments.grid import Row
 from experiments.run_folders import FolderJob
 from experiments.study import Study
-from experiments.target_hits.choice import check_count, usable_cores
+from experiments.target_hits.choice import MOST_WORKERS, check_count, usable_cores
 from experiments.workers import Key, Work
 
 ASize = TypeVar("ASize")
@@ -72,7 +72,7 @@ class StudyProgram(Generic[ASize, AJob]):
         folder = out.absolute()
 
         def run() -> int:
-            workers = check_count("--workers", options.workers)
+            workers = check_count("--workers", options.workers, MOST_WORKERS)
             if (most := self.most_workers(size)) is not None:
                 workers = min(workers, most)
             plan = self.plan(size)

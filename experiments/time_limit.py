@@ -27,6 +27,7 @@ from experiments.grid import GridRecord, failure_text, key_text, run_grid
 from experiments.target_hits.advice import TaskFacts, advice
 from experiments.target_hits.certainty import FEWEST_BLOCKS
 from experiments.target_hits.choice import (
+    MOST_WORKERS,
     TaskChoice,
     add_options,
     check_count,
@@ -143,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _answer(options: argparse.Namespace, console: Console) -> int:
     limits = check_limits(options.limits)
-    workers = check_count("--workers", options.workers)
+    workers = check_count("--workers", options.workers, MOST_WORKERS)
     if options.seed < 0:
         raise ConfigError(f"--seed {options.seed}: expected at least 0")
     choice = choose_task(options.task, options.preset, options.set)

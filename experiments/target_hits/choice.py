@@ -27,6 +27,11 @@ LIMITS = (1, 2, 5, 10, 25, 50, 100, 500, 1000, 5000)
 PREFERRED_PRESET = "thesis"
 """Taken where a task has it and nobody asks for another: its numbers can be compared with the thesis's."""
 
+MOST = 1_000_000_000
+"""Of whatever is counted."""
+MOST_SEEDS = 10_000
+"""Every job is listed before the first one begins."""
+MOST_WORKERS = 256
 _FIRST_LOOK_STEPS = 100
 _SECTION = "task"
 _ROBOTS_SIDE = "services.robot_bridge."
@@ -200,14 +205,16 @@ def check_limits(limits: Sequence[int]) -> tuple[int, ...]:
     return tuple(sorted(set(limits)))
 
 
-def check_count(option: str, value: int) -> int:
-    """``value``, if there can be so many.
+def check_count(option: str, value: int, most: int = MOST) -> int:
+    """``value``, if there can be so many: from one to ``most``.
 
     Raises:
         ConfigError: there cannot.
     """
     if value < 1:
         raise ConfigError(f"{option} {value}: expected at least 1")
+    if value > most:
+        raise ConfigError(f"{option} {value}: expected at most {most}")
     return value
 
 

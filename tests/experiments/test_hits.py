@@ -121,8 +121,10 @@ def test_a_goal_that_is_never_reached_gives_zeros(tmp_path):
     [
         (["--limits", "0"], "--limits 0: expected at least 1 step"),
         (["--seeds", "0"], "--seeds 0: expected at least 1"),
+        (["--seeds", "10001"], "--seeds 10001: expected at most 10000"),
         (["--steps", "-5"], "--steps -5: expected at least 1"),
         (["--workers", "0"], "--workers 0: expected at least 1"),
+        (["--workers", "257"], "--workers 257: expected at most 256"),
         (["--task", "noise_frames"], "no goal to hit"),
     ],
 )
