@@ -6,8 +6,11 @@ Prints one table and writes it as JSON; the exit code is 1 where a budget fails.
 from __future__ import annotations
 
 import argparse
+import errno
+import os
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -51,6 +54,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.quick:
         comparisons = [comparison.quick() for comparison in comparisons]
     try:
+        _try_to_write_beside(options.out)
+    except OSError as error:
+        print(f"benchmarks.bench: error: --out {options.out}: {error.strerror}; choose another file", file=sys.stderr)
+        return 1
+    try:
         rows, notes = measure(comparisons)
     except KeyboardInterrupt:
         print("\ninterrupted: nothing was written", file=sys.stderr)
@@ -61,6 +69,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     write_atomically(options.out, to_json(rows))
     print(f"written to {options.out}")
     return exit_code(rows)
+
+
+def _try_to_write_beside(path: Path) -> None:
+    """Find out before minutes of measuring; raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=path.parent):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
 
 
 def measure(comparisons: Sequence[Comparison]) -> tuple[list[Row], list[str]]:

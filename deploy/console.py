@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import sys
@@ -22,8 +23,9 @@ class Console:
         errors: TextIO | None = None,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._out = out or sys.stdout
-        self._errors = errors or sys.stderr
+        # A program that was started with its outputs closed has none.
+        self._out = out or sys.stdout or io.StringIO()
+        self._errors = errors or sys.stderr or io.StringIO()
         self._now_s = now_s
         self._rewrites = self._out.isatty()
         self._status_shown = False
@@ -56,11 +58,16 @@ class Console:
 
     def _write(self, stream: TextIO, text: str) -> None:
         try:
-            stream.write(text)
+            try:
+                stream.write(text)
+            except UnicodeEncodeError as error:  # an output that is not UTF-8: everything else can still be read
+                stream.write(text.encode(error.encoding, "replace").decode(error.encoding))
             stream.flush()
-        except (OSError, ValueError):
+        except (OSError, ValueError) as error:
             # `launch | tee` and Ctrl-C: tee is gone first, and the run's record still has to be completed.
             _silence(stream)
+            if stream is self._out and isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
+                self._write(self._errors, f"nothing more is shown: the output cannot be written: {error.strerror}\n")
 
 
 def _silence(stream: TextIO) -> None:

@@ -96,9 +96,11 @@ class GridRecord:
             file.write(f"{key_text(failure.key)}: {failure.reason}\n{failure.details}\n")
 
     def _settle_settings(self, settings: Mapping[str, Any]) -> None:
-        path = self.directory / "settings.json"
+        path, results = self.directory / "settings.json", self.directory / "results.jsonl"
         wanted = json.loads(json.dumps(settings))
         known: dict[str, Any] = {}
+        if not path.exists() and results.exists() and results.stat().st_size:
+            raise GridError(f"{path} is missing, so nobody knows what the results there are of; {_ANOTHER_FOLDER}")
         if path.exists():
             try:
                 known = dict(json.loads(path.read_text(encoding="utf-8")))

@@ -16,6 +16,7 @@ from common.record import write_atomically
 from deploy.console import Console
 from experiments.command_line import exit_code
 from experiments.grid import GridRecord
+from experiments.loading import uninterrupted
 from experiments.target_hits.choice import (
     MOST_SEEDS,
     MOST_WORKERS,
@@ -46,7 +47,8 @@ def _count(options: argparse.Namespace, console: Console) -> int:
     seeds = range(check_count("--seeds", options.seeds, MOST_SEEDS))
     steps = check_count("--steps", options.steps)
     workers = check_count("--workers", options.workers, MOST_WORKERS)
-    choices = [choose_task(name, options.preset, options.set) for name in dict.fromkeys(options.task)]
+    names = list(dict.fromkeys(options.task))
+    choices = uninterrupted(lambda: [choose_task(name, options.preset, options.set) for name in names])
     settings = record_settings(choices, steps=steps)
     return count_grid(
         Path(options.out),

@@ -1,15 +1,29 @@
-"""What takes most of a run's start, done where Ctrl-C can end it."""
+"""What takes most of a program's start, done where Ctrl-C can end it, or is held back."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 from common.algorithms import load_algorithm
 from deploy.stop_signals import StopSignals
+
+Made = TypeVar("Made")
+
+
+def uninterrupted(make: Callable[[], Made]) -> Made:
+    """Return what ``make`` makes; Ctrl-C meanwhile is a KeyboardInterrupt at its end. For the main thread.
+
+    In the middle of it, while compiled code is imported, it would be an ImportError.
+    """
+    with StopSignals() as stop:
+        made = make()
+    if stop.asked:
+        raise KeyboardInterrupt
+    return made
 
 
 def load_libraries(algorithm: str, stop: StopSignals) -> None:

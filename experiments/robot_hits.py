@@ -22,6 +22,7 @@ from common.record import write_atomically
 from deploy.console import Console
 from experiments.command_line import exit_code
 from experiments.grid import GridRecord
+from experiments.loading import uninterrupted
 from experiments.target_hits.choice import (
     MOST_SEEDS,
     MOST_WORKERS,
@@ -83,7 +84,7 @@ def _count(options: argparse.Namespace, console: Console, table: Sequence[Thesis
     steps = check_count("--steps", options.steps)
     workers = check_count("--workers", options.workers, MOST_WORKERS)
     rows = chosen_rows(table, options.task)
-    choices = {row.task: choose_task(row.task) for row in rows}
+    choices = uninterrupted(lambda: {row.task: choose_task(row.task) for row in rows})
     limits = {row: limit_steps(row, choices[row.task]) for row in rows}
 
     def report(record: GridRecord) -> int:

@@ -12,7 +12,7 @@ from deploy.console import Console
 from experiments.command_line import exit_code
 from experiments.grid import Row
 from experiments.run_folders import FolderJob
-from experiments.study import Study
+from experiments.study import Study, refuse_foreign
 from experiments.target_hits.choice import MOST_WORKERS, check_count, usable_cores
 from experiments.workers import Key, Work
 
@@ -84,8 +84,10 @@ class StudyProgram(Generic[ASize, AJob]):
                 plan.jobs,
                 plan.settings(),
                 plan.expected_s,
-                lambda rows, failures: self.write_results(size, rows, failures, folder, console),
+                lambda rows, failures, into: self.write_results(size, rows, failures, into, console),
             )
+            if folder != (self.results / options.size).absolute():  # there, published results are to be replaced
+                refuse_foreign(folder)
             return study.run(folder, workers, console, work)
 
         return exit_code(self.name, "--out", out, console, run)

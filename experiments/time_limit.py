@@ -24,6 +24,7 @@ from deploy.console import Console
 from deploy.stop_signals import INTERRUPTED, StopSignals
 from experiments.command_line import exit_code
 from experiments.grid import GridRecord, failure_text, key_text, run_grid
+from experiments.loading import uninterrupted
 from experiments.target_hits.advice import TaskFacts, advice
 from experiments.target_hits.certainty import FEWEST_BLOCKS
 from experiments.target_hits.choice import (
@@ -147,7 +148,7 @@ def _answer(options: argparse.Namespace, console: Console) -> int:
     workers = check_count("--workers", options.workers, MOST_WORKERS)
     if options.seed < 0:
         raise ConfigError(f"--seed {options.seed}: expected at least 0")
-    choice = choose_task(options.task, options.preset, options.set)
+    choice = uninterrupted(lambda: choose_task(options.task, options.preset, options.set))
     thoroughness = Thoroughness()
     effort = check_count("--effort", options.effort)
     if effort < max(limits):

@@ -80,15 +80,16 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
             run.stop("interrupted")
 
     log = run_dir / "logs" / "train.log"
+    begun: InProcessRun | None = None
     try:
         with _log_to(log):
             begun = plan.begin()
             begun.run(look)
-    except ConfigError:
-        if is_new:  # Nothing has begun: the corrected command may use the same folder.
-            shutil.rmtree(run_dir, ignore_errors=True)
-        raise
     except RelodError as error:
+        if begun is None or isinstance(error, ConfigError):
+            if is_new:  # Nothing has begun: the corrected command may use the same folder.
+                shutil.rmtree(run_dir, ignore_errors=True)
+            raise
         raise ServiceError(f"{error}; see {log}. python -m deploy.summary {run_dir} shows what there is") from error
     summary = summarise(read_record(run_dir))
     paths = [write_summary(run_dir, summary), write_curve(run_dir, summary)]

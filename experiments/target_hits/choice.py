@@ -202,6 +202,8 @@ def check_limits(limits: Sequence[int]) -> tuple[int, ...]:
     for limit in limits:
         if limit < 1:
             raise ConfigError(f"--limits {limit}: expected at least 1 step")
+        if limit > MOST:
+            raise ConfigError(f"--limits {limit}: expected at most {MOST} steps")
     return tuple(sorted(set(limits)))
 
 

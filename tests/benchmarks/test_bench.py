@@ -51,6 +51,17 @@ def test_budgets_that_hold_are_a_success(measured, tmp_path):
     assert rows(tmp_path / "bench.json") == {"fast_ms": True}
 
 
+@pytest.mark.parametrize(("out", "reason"), [("file/bench.json", "File exists"), ("folder", "Is a directory")])
+def test_a_result_that_cannot_be_written_is_refused_before_anything_is_measured(
+    measured, tmp_path, capsys, out, reason
+):
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "folder").mkdir()
+    assert bench.main(["--out", str(tmp_path / out)]) == 1
+    assert reason in capsys.readouterr().err
+    assert measured == []
+
+
 def test_a_budget_that_fails_is_a_failure(measured, tmp_path):
     assert bench.main(["--only", "fast", "slow", "--out", str(tmp_path / "bench.json")]) == 1
     assert rows(tmp_path / "bench.json") == {"fast_ms": True, "slow_ms": False}

@@ -3,6 +3,8 @@
 import io
 import os
 
+import pytest
+
 from deploy.console import PLAIN_PERIOD_S, Console
 
 
@@ -29,6 +31,31 @@ def test_elsewhere_the_status_is_a_line_now_and_then() -> None:
         console.status(f"at {now_s:g}")
     console.line("end")
     assert out.getvalue() == "at 0\nat 11\nend\n"
+
+
+def test_an_output_without_a_letter_shows_the_rest() -> None:
+    out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    console = Console(out, io.StringIO())
+    console.line("3 \u00b1 1")
+    console.line("end")
+    assert out.buffer.getvalue() == b"3 ? 1\nend\n"  # type: ignore[attr-defined]
+
+
+def test_an_output_that_is_full_is_told_once() -> None:
+    errors = io.StringIO()
+    with open("/dev/full", "w", encoding="utf-8") as out:
+        console = Console(out, errors)
+        for _ in range(3):
+            console.line("nobody reads this")
+    assert errors.getvalue() == "nothing more is shown: the output cannot be written: No space left on device\n"
+
+
+def test_without_outputs_nothing_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout", None)
+    monkeypatch.setattr("sys.stderr", None)
+    console = Console()
+    console.status("going on")
+    console.error("an error")
 
 
 def test_a_reader_who_has_left_is_no_error() -> None:

@@ -132,3 +132,10 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path):
     with pytest.raises(GridError, match=r"holds other files \(hits.csv\)"), GridRecord(tmp_path, SETTINGS):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["hits.csv"]
+
+
+def test_results_without_their_settings_are_refused(tmp_path):
+    run(tmp_path)
+    (tmp_path / "settings.json").unlink()
+    with pytest.raises(GridError, match=r"settings\.json is missing, so nobody knows"):
+        run(tmp_path)

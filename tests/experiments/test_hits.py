@@ -120,6 +120,7 @@ def test_a_goal_that_is_never_reached_gives_zeros(tmp_path):
     ("options", "words"),
     [
         (["--limits", "0"], "--limits 0: expected at least 1 step"),
+        (["--limits", "1000000001"], "--limits 1000000001: expected at most 1000000000 steps"),
         (["--seeds", "0"], "--seeds 0: expected at least 1"),
         (["--seeds", "10001"], "--seeds 10001: expected at most 10000"),
         (["--steps", "-5"], "--steps -5: expected at least 1"),

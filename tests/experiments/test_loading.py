@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from deploy.stop_signals import StopSignals
-from experiments.loading import load_libraries
+from experiments.loading import load_libraries, uninterrupted
 
 ROOT = Path(__file__).parents[2]
 
@@ -59,7 +59,7 @@ def test_nothing_of_torch_is_left_for_the_services_to_load():
     program = """
 import sys
 from deploy.stop_signals import StopSignals
-from experiments.loading import load_libraries
+from experiments.loading import load_libraries, uninterrupted
 load_libraries("sac", StopSignals())
 before = set(sys.modules)
 import torch
@@ -70,3 +70,16 @@ print(sorted(name for name in set(sys.modules) - before if name.partition(".")[0
 """
     result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, capture_output=True, text=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_a_stop_is_held_back_until_something_is_made():
+    made = []
+
+    def make():
+        os.kill(os.getpid(), signal.SIGINT)
+        time.monotonic()
+        made.append("whole")
+
+    with pytest.raises(KeyboardInterrupt):
+        uninterrupted(make)
+    assert made == ["whole"]

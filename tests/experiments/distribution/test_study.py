@@ -8,6 +8,7 @@ import pytest
 from deploy.stop_signals import INTERRUPTED
 from experiments.distribution.__main__ import main
 from experiments.distribution.jobs import DistributionError, Job, work
+from experiments.study import SO_FAR
 from tests.experiments.distribution.studies_by_hand import (
     HAND_MADE,
     REMOTE_LOCAL,
@@ -56,13 +57,23 @@ def test_interrupted_and_resumed_with_other_workers_it_gives_the_same_tables(tmp
     summary = resumed / "runs" / TINY.jobs()[0].folder / "summary.json"
     written_ns = summary.stat().st_mtime_ns
     assert "1 of 2 jobs are kept; the same command goes on" in capsys.readouterr().out
-    assert tables(resumed)["results.csv"].count("not run yet") == 1
+    assert tables(resumed / "runs" / SO_FAR)["results.csv"].count("not run yet") == 1
+    assert not (resumed / "results.csv").exists(), "there may be a whole study's"
 
     assert run(resumed, workers=1) == 0
     assert f"{remote_local.folder} was interrupted: removed, it begins again" in capsys.readouterr().out
     assert tables(resumed) == tables(whole)
+    assert not (resumed / "runs" / SO_FAR).exists()
     assert summary.stat().st_mtime_ns == written_ns  # The finished run was not repeated.
     assert len(finished(resumed)) == len(set(finished(resumed))) == 2
+
+
+def test_files_that_are_no_study_s_are_not_touched(tmp_path, capsys):
+    (tmp_path / "README.md").write_text("mine", encoding="utf-8")
+    assert run(tmp_path, HAND_MADE, hand_made) == 1
+    assert f"{tmp_path} holds other files (README.md): expected an empty folder" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
+    assert (tmp_path / "README.md").read_text(encoding="utf-8") == "mine"
 
 
 def test_a_crashed_run_is_kept_and_reported_while_the_rest_goes_on(tmp_path, capsys):

@@ -51,6 +51,7 @@ def test_interrupted_and_resumed_with_other_workers_it_gives_the_same_tables(tmp
     half = next(job for job in TINY.jobs() if job.limit == 50)
     assert (resumed / "runs" / half.folder).exists()
     assert "1 of 8 jobs are kept; the same command goes on" in capsys.readouterr().out
+    assert not (resumed / "README.md").exists(), "there may be a whole study's"
 
     assert run(resumed, workers=2) == 0
     assert f"{half.folder} was interrupted: removed, it begins again" in capsys.readouterr().out
