@@ -107,9 +107,7 @@ class GridRecord:
             except (ValueError, TypeError) as error:
                 raise GridError(f"{path} cannot be understood: {error}; {_ANOTHER_FOLDER}") from error
         different = [
-            f"{name}: {known[name]!r} there, now {value!r}"
-            for name, value in wanted.items()
-            if name in known and known[name] != value
+            text for name, value in wanted.items() if name in known for text in _differences(name, known[name], value)
         ]
         if different:
             raise ConfigError(
@@ -132,6 +130,14 @@ class GridRecord:
                 path = self.directory / "results.jsonl"
                 raise GridError(f"{path}, line {number} cannot be understood: {error!r}; delete the line") from error
             self.rows[key] = row
+
+
+def _differences(name: str, there: Any, now: Any) -> list[str]:
+    """What two values of a setting differ in, to be read."""
+    if isinstance(there, dict) and isinstance(now, dict):
+        keys = dict.fromkeys([*there, *now])
+        return [text for key in keys for text in _differences(f"{name}, {key}", there.get(key), now.get(key))]
+    return [] if there == now else [f"{name}: {there!r} there, now {now!r}"]
 
 
 def _refuse_foreign(directory: Path) -> None:

@@ -134,6 +134,13 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["hits.csv"]
 
 
+def test_of_large_settings_only_what_differs_is_told(tmp_path):
+    settings = {"offset": 10, "task": {"preset": "demo", "limits": [1, 2]}}
+    run(tmp_path, settings=settings)
+    with pytest.raises(ConfigError, match=r"settings \(task, preset: 'demo' there, now 'thesis'\): ask"):
+        run(tmp_path, settings={**settings, "task": {**settings["task"], "preset": "thesis"}})
+
+
 def test_results_without_their_settings_are_refused(tmp_path):
     run(tmp_path)
     (tmp_path / "settings.json").unlink()
