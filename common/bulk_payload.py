@@ -8,11 +8,12 @@ that, a length before them may be written in more bytes than it needs. Any msgpa
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import msgpack
-import numpy as np
 import numpy.typing as npt
 
 ALIGNMENT = 4
@@ -22,6 +23,17 @@ _LONGEST_HEAD = 1 << 16
 _BIN_32 = b"\xc6"
 
 
+@dataclass(frozen=True)
+class Seal:
+    """A text before the array that depends on the array's bytes, and how to make it while they are copied."""
+
+    field: str
+    """The text's field. It is packed with another text of the same length, which is overwritten."""
+    copy: Callable[[Sequence[npt.NDArray[Any]], int, int], str]
+    """Copies the bytes of contiguous arrays, one after the other, and returns the text. Its arguments: the arrays, how
+    many bytes they have, and the address to copy to."""
+
+
 def pack_bulk(
     values: Mapping[str, Any],
     name: str,
@@ -29,6 +41,7 @@ def pack_bulk(
     shape: Sequence[int],
     pieces: Sequence[npt.NDArray[Any]],
     default: Callable[[Any], Any],
+    seal: Seal | None = None,
 ) -> bytes:
     """Return a map of ``values`` and, last, an array.
 
@@ -39,29 +52,40 @@ def pack_bulk(
         shape: of the array.
         pieces: contiguous arrays whose bytes, one after the other, are the array's.
         default: what msgpack packs instead of something it does not know.
+        seal: makes one of ``values``, in ASCII, while it copies the pieces; None: they are copied as they are.
     """
     packer = msgpack.Packer(default=default, use_bin_type=True, autoreset=False)
     packer.pack_map_header(len(values) + 1)
+    seal_end = 0
     for key, value in values.items():
         packer.pack(key)
         packer.pack(value)
+        if seal is not None and key == seal.field:
+            seal_end = len(packer.getbuffer())
     packer.pack(name)
     before, text = packer.bytes(), dtype.encode()
     packed_shape = msgpack.packb(list(shape))
     size = sum(piece.nbytes for piece in pieces)
     missing = -(len(before) + 2 + len(text) + len(packed_shape) + 5) % ALIGNMENT
-    return b"".join(
-        [
-            before,
-            b"\xdc\x00\x03" if missing & 2 else b"\x93",  # array of three, in three bytes or in one
-            bytes([0xD9, len(text)] if missing & 1 else [0xA0 | len(text)]),  # length of a text, in two or in one
-            text,
-            packed_shape,
-            _BIN_32,
-            size.to_bytes(4, "big"),
-            *(piece.data for piece in pieces if piece.size),
-        ]
-    )
+    head = [
+        before,
+        b"\xdc\x00\x03" if missing & 2 else b"\x93",  # array of three, in three bytes or in one
+        bytes([0xD9, len(text)] if missing & 1 else [0xA0 | len(text)]),  # length of a text, in two or in one
+        text,
+        packed_shape,
+        _BIN_32,
+        size.to_bytes(4, "big"),
+    ]
+    if seal is None:
+        return b"".join([*head, *(piece.data for piece in pieces if piece.size)])
+    joined = b"".join(head)
+    payload, address = _new_bytes(len(joined) + size)
+    sealed = seal.copy(pieces, size, address + len(joined)).encode("ascii")
+    if len(sealed) != len(values[seal.field]):
+        raise ValueError(f"{seal.field}: expected a text as long as {values[seal.field]!r}, got {sealed!r}")
+    ctypes.memmove(address, joined, len(joined))
+    ctypes.memmove(address + seal_end - len(sealed), sealed, len(sealed))
+    return payload
 
 
 def unpack_bulk(payload: bytes) -> dict[str, Any] | None:
@@ -91,4 +115,21 @@ def unpack_bulk(payload: bytes) -> dict[str, Any] | None:
 
 def as_aligned(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return ``array``, or a copy where its bytes begin at an address that processors do not want."""
-    return np.require(array, requirements="A")
+    return array if array.flags.aligned else array.copy()
+
+
+def _new_bytes(size: int) -> tuple[bytes, int]:
+    """Return bytes with nothing in them yet, and their address.
+
+    Whoever makes bytes may write to them as long as nobody else has seen them: so says the documentation of the two
+    functions of CPython that are called here. A bytearray, or what BytesIO makes room for, would be zeroed first, and
+    ``bytes`` of a bytearray is a copy.
+    """
+    payload = _PyBytes_FromStringAndSize(None, size)
+    return payload, _PyBytes_AsString(payload)
+
+
+_PyBytes_FromStringAndSize = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_char_p, ctypes.c_ssize_t)(
+    ("PyBytes_FromStringAndSize", ctypes.pythonapi)
+)
+_PyBytes_AsString = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object)(("PyBytes_AsString", ctypes.pythonapi))

@@ -17,13 +17,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import cache
+from itertools import chain
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgpack
 import numpy as np
 import numpy.typing as npt
 
-from common.bulk_payload import pack_bulk, unpack_bulk
+from common.bulk_payload import Seal, pack_bulk, unpack_bulk
 from common.errors import MessageError, SchemaVersionError
 from common.frame_encoding import EncodedFrames, FrameEncoding
 from common.messages import (
@@ -67,16 +68,19 @@ def encode(message: Any) -> bytes:
     return packed
 
 
-def encode_gathered(message: type, values: Mapping[str, Any], pieces: Sequence[npt.NDArray[Any]]) -> bytes:
+def encode_gathered(
+    message: type, values: Mapping[str, Any], pieces: Sequence[npt.NDArray[Any]], seal: Seal | None = None
+) -> bytes:
     """Return the payload of a message of :data:`BULK_FIELDS` whose large array is bytes that lie in several places.
 
     Args:
         message: the message's type.
         values: its other fields.
         pieces: contiguous arrays, whose bytes follow each other in the message.
+        seal: makes one of ``values`` while it copies the pieces.
     """
     head = {"schema": SCHEMA_VERSION, "message": message.__name__, **values}
-    return pack_bulk(head, BULK_FIELDS[message], "|u1", [sum(piece.nbytes for piece in pieces)], pieces, _plain)
+    return pack_bulk(head, BULK_FIELDS[message], "|u1", [sum(piece.nbytes for piece in pieces)], pieces, _plain, seal)
 
 
 def decode(payload: bytes, expected: type[Message], dimensions: Dimensions | None = None) -> Message:
@@ -197,6 +201,8 @@ def _decoder(hint: Any, bounds: Bounds = _UNBOUNDED) -> Decoder:
         element = _decoder(arguments[0])
         if arguments[0] in (str, int):
             return _plain_list_decoder(arguments[0], element)
+        if arguments[0] == list[int]:
+            return _nested_list_decoder(element)
         return lambda value, where, sizes: [element(item, where, sizes) for item in _instance(value, list, where)]
     if isinstance(hint, type) and is_dataclass(hint):
         return lambda value, where, sizes: _decode_dataclass(hint, value, where, sizes)
@@ -223,6 +229,19 @@ def _plain_list_decoder(kind: type, element: Decoder) -> Decoder:
         return [element(item, where, sizes) for item in _instance(value, list, where)]
 
     return decode_list
+
+
+def _nested_list_decoder(element: Decoder) -> Decoder:
+    """Return what decodes a list of lists of any integers: if all their types are right, so are they."""
+    lists, integers = {list}, {int}
+
+    def decode_lists(value: Any, where: str, sizes: Sizes) -> list[Any]:
+        are_lists = type(value) is list and lists.issuperset(map(type, value))
+        if are_lists and integers.issuperset(map(type, chain.from_iterable(value))):
+            return value
+        return [element(item, where, sizes) for item in _instance(value, list, where)]
+
+    return decode_lists
 
 
 def _instance(value: Any, cls: type, where: str) -> Any:

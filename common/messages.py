@@ -129,7 +129,7 @@ class TaskSpec:
     @property
     def dimensions(self) -> Dimensions:
         """Sizes for checking the run's other messages."""
-        height, width, channels = (int(n) for n in self.frame_shape)
+        height, width, channels = self.frame_shape.tolist()
         return Dimensions(
             A=len(self.action_low),
             P=len(self.proprioception_low),

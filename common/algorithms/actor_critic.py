@@ -22,7 +22,7 @@ from common.networks.encoder import Encoder
 from common.networks.mlp import Actor
 from common.networks.sizes import FEATURES, cropped_shape
 from common.policies.unit_range import action_range, proprioception_range
-from common.policies.weights import encode_weights, initial_parameters
+from common.policies.weights import encode_weights, initial_parameters, prepare_encoding
 
 
 class ActorCritic(Algorithm):
@@ -66,6 +66,7 @@ class ActorCritic(Algorithm):
         self._actions = action_range(spec)
         self._proprioception = proprioception_range(spec)
         self._strides = config.encoder_strides if spec.has_camera else ()
+        prepare_encoding(self._strides, config.weights_dtype)
         self._generator = torch.Generator(self._device)
         self._generator.manual_seed(update_seed)
         self._metrics: dict[str, Tensor] = {}

@@ -18,7 +18,7 @@ FEATURES = 2 * CHANNELS
 def cropped_shape(spec: TaskSpec) -> tuple[int, int, int]:
     """Return (height, width, S * C) of the stacked frames after the RAD crop (thesis 3.6)."""
     sizes = spec.dimensions
-    margin_y, margin_x = (int(n) for n in spec.crop_margin)
+    margin_y, margin_x = spec.crop_margin.tolist()
     return sizes.H - 2 * margin_y, sizes.W - 2 * margin_x, sizes.S * sizes.C
 
 

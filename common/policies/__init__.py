@@ -13,7 +13,7 @@ from common.policies.numpy_policy import NumpyPolicy
 from common.policies.weights import (
     initial_parameters,
     pack_weights,
-    parameter_shapes,
+    parameter_layout,
     pending_actions_of,
     unpack_weights,
 )
@@ -54,9 +54,9 @@ def initial_policy(
         zero_initialised_head=zero_initialised_head,
     )
     if spec.has_camera:
-        from common.policies.fused_check import load
+        from common.policies.xxh3 import compile_take_in
 
-        load()  # compiled now, not when the first policy comes
+        compile_take_in()  # compiled now, not when the first policy comes
     return _policy(spec, parameters, 0, encoder_strides)
 
 
@@ -69,7 +69,7 @@ def policy_from_weights(spec: TaskSpec, weights: PolicyWeights) -> Policy:
     strides = weights.encoder_strides.tolist()
     if spec.has_camera != bool(strides) or not all(1 <= stride <= 4 for stride in strides):
         raise MessageError(f"policy weights {weights.version}: encoder strides {strides} do not fit {spec.task}")
-    parameters = unpack_weights(weights, parameter_shapes(spec, weights.hidden_size, strides))
+    parameters = unpack_weights(weights, parameter_layout(spec, weights.hidden_size, strides))
     try:
         return _policy(spec, parameters, weights.version, strides)
     except ConfigError as error:

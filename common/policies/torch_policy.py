@@ -29,7 +29,7 @@ class TorchPolicy:
         """Take over ``parameters``, named and shaped as in :mod:`common.policies.weights`."""
         self.version = version
         self._height, self._width, _ = cropped_shape(spec)
-        self._top, self._left = (int(n) for n in spec.crop_margin)
+        self._top, self._left = spec.crop_margin.tolist()
         # Not in bfloat16: for a single observation converting the images costs more than it saves.
         self._layers = _layers(parameters, encoder_strides)
         self._positions = _positions(self._height, self._width, tuple(encoder_strides))

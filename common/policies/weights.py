@@ -18,15 +18,16 @@ Names and shapes (A actions, P proprioception, H hidden size, K = 3 * 3 convolut
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Mapping, Sequence, Sized
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import xxhash
 
-from common.bulk_payload import as_aligned
+from common.bulk_payload import Seal, as_aligned
 from common.codec import decode, encode_gathered
 from common.errors import MessageError
 from common.messages import Float32Array, PolicyWeights, TaskSpec
@@ -34,17 +35,44 @@ from common.networks.sizes import CHANNELS, FEATURES, KERNEL
 
 _FIRST_WEIGHT = "actor.0.weight"
 _HEAD_WEIGHT, _HEAD_BIAS = "actor.2.weight", "actor.2.bias"
+_NO_DIGEST = "0" * 32
+"""As long as a digest."""
 _WIRE_DTYPES: dict[str, np.dtype[Any]] = {"float32": np.dtype("<f4"), "float16": np.dtype("<f2")}
+
+
+@dataclass(frozen=True)
+class ParameterLayout:
+    """The names and shapes of a policy's parameters, in the order of the buffer."""
+
+    names: list[str]
+    """Names, as in :class:`PolicyWeights`."""
+    shapes: list[list[int]]
+    """Shapes, in the same order."""
+
+    @cached_property
+    def by_name(self) -> Mapping[str, list[int]]:
+        """Name -> shape, in the same order."""
+        return dict(zip(self.names, self.shapes, strict=True))
+
+    @cached_property
+    def record(self) -> np.dtype[np.void]:
+        """A buffer's type in NumPy: with it, a parameter is found without counting."""
+        return np.dtype([(name, np.float32, tuple(shape)) for name, shape in self.by_name.items()])
+
+
+def parameter_layout(spec: TaskSpec, hidden_size: int, encoder_strides: Sequence[int]) -> ParameterLayout:
+    """Return what a policy's parameters are."""
+    sizes = spec.dimensions
+    return _layout(sizes.A, sizes.P, sizes.S * sizes.C, hidden_size, len(encoder_strides))
 
 
 def parameter_shapes(spec: TaskSpec, hidden_size: int, encoder_strides: Sequence[int]) -> Mapping[str, list[int]]:
     """Return the names and shapes of a policy's parameters, in the order of the buffer."""
-    sizes = spec.dimensions
-    return _shapes(sizes.A, sizes.P, sizes.S * sizes.C, hidden_size, len(encoder_strides))
+    return parameter_layout(spec, hidden_size, encoder_strides).by_name
 
 
 @lru_cache(maxsize=16)  # all policies of a task have the same
-def _shapes(actions: int, proprioception: int, channels: int, hidden_size: int, layers: int) -> Mapping[str, list[int]]:
+def _layout(actions: int, proprioception: int, channels: int, hidden_size: int, layers: int) -> ParameterLayout:
     shapes: dict[str, list[int]] = {}
     inputs = proprioception + actions
     if channels:
@@ -60,7 +88,7 @@ def _shapes(actions: int, proprioception: int, channels: int, hidden_size: int, 
         shapes[f"actor.{layer}.weight"] = [rows, columns]
         shapes[f"actor.{layer}.bias"] = [rows]
     shapes["log_std_bounds"] = [2]
-    return shapes
+    return ParameterLayout(list(shapes), list(shapes.values()))
 
 
 def pending_actions_of(weights: PolicyWeights, spec: TaskSpec) -> int:
@@ -119,7 +147,7 @@ def encode_weights(
             learns looks at its losses, and whoever acts at every number.
     """
     wire = _wire_dtype(dtype)
-    pieces, digest = [], xxhash.xxh3_128()
+    pieces = []
     for name, values in parameters.items():
         piece = np.ascontiguousarray(values)
         if values.dtype != wire:
@@ -128,7 +156,7 @@ def encode_weights(
             if not np.isfinite(piece).all():
                 raise MessageError(f"policy weights after {updates} updates: {name} has no finite numbers in {dtype}")
         pieces.append(piece)
-        digest.update(piece.data)
+    seal = _seal(encoder_strides, wire)
     fields = {
         "version": version,
         "updates": updates,
@@ -138,9 +166,17 @@ def encode_weights(
         "names": list(parameters),
         "shapes": [list(values.shape) for values in parameters.values()],
         "dtype": dtype,
-        "digest": digest.hexdigest(),
+        "digest": _digest(pieces) if seal is None else _NO_DIGEST,
     }
-    return encode_gathered(PolicyWeights, fields, pieces)
+    return encode_gathered(PolicyWeights, fields, pieces, seal)
+
+
+def prepare_encoding(encoder_strides: Sequence[int], dtype: str) -> None:
+    """Compile what :func:`encode_weights` needs, not when the first policy is pushed."""
+    if _is_large(encoder_strides, _wire_dtype(dtype)):
+        from common.policies.xxh3 import compile_take_in_and_copy
+
+        compile_take_in_and_copy()
 
 
 def pack_weights(
@@ -166,8 +202,8 @@ def pack_weights(
     return decode(payload, PolicyWeights)
 
 
-def unpack_weights(weights: PolicyWeights, expected: Mapping[str, list[int]]) -> dict[str, Float32Array]:
-    """Return name -> array, for names and shapes that the task's policy has.
+def unpack_weights(weights: PolicyWeights, expected: ParameterLayout) -> dict[str, Float32Array]:
+    """Return name -> array, for names and shapes that the task's policy has, in whatever order they come.
 
     Raises:
         MessageError: the buffer was changed on its way, does not fit the names and shapes, is not finite, or
@@ -177,15 +213,10 @@ def unpack_weights(weights: PolicyWeights, expected: Mapping[str, list[int]]) ->
     digest, is_finite = _looked_at(weights, wire)
     if weights.digest != digest:
         raise MessageError(f"policy weights {weights.version}: expected digest {weights.digest}, got {digest}")
-    got = dict(zip(weights.names, weights.shapes, strict=False))
-    if len(weights.names) != len(weights.shapes) or got != expected:
-        differing = sorted(n for n in got.keys() | expected.keys() if got.get(n) != expected.get(n))
-        raise MessageError(
-            f"policy weights {weights.version} are for another network: {differing[0] if differing else 'names'}: "
-            f"expected shape {expected.get(differing[0]) if differing else None}, "
-            f"got {got.get(differing[0]) if differing else None}"
-        )
-    size = sum(math.prod(shape) for shape in weights.shapes)
+    layout = expected
+    if weights.names != expected.names or weights.shapes != expected.shapes:
+        layout = _in_another_order(weights, expected)
+    size = layout.record.itemsize // 4
     if weights.buffer.nbytes != size * wire.itemsize:
         raise MessageError(
             f"policy weights {weights.version}: expected {size * wire.itemsize} bytes, got {weights.buffer.nbytes}"
@@ -193,13 +224,21 @@ def unpack_weights(weights: PolicyWeights, expected: Mapping[str, list[int]]) ->
     flat = as_aligned(weights.buffer.view(wire)).astype(np.float32, copy=False)
     if not (_all_finite(flat) if is_finite is None else is_finite):
         raise MessageError(f"policy weights {weights.version}: expected finite numbers, got NaN or infinity")
-    parameters: dict[str, Float32Array] = {}
-    start = 0
-    for name, shape in zip(weights.names, weights.shapes, strict=True):
-        end = start + math.prod(shape)
-        parameters[name] = flat[start:end].reshape(shape)
-        start = end
-    return parameters
+    record = flat.view(layout.record)[0]
+    return {name: record[name] for name in layout.names}
+
+
+def _in_another_order(weights: PolicyWeights, expected: ParameterLayout) -> ParameterLayout:
+    """Return the layout of weights that are not laid out as ``expected``, if that is the only difference."""
+    got, wanted = dict(zip(weights.names, weights.shapes, strict=False)), expected.by_name
+    if not len(weights.names) == len(weights.shapes) == len(got) or got != wanted:
+        differing = sorted(n for n in got.keys() | wanted.keys() if got.get(n) != wanted.get(n))
+        raise MessageError(
+            f"policy weights {weights.version} are for another network: {differing[0] if differing else 'names'}: "
+            f"expected shape {wanted.get(differing[0]) if differing else None}, "
+            f"got {got.get(differing[0]) if differing else None}"
+        )
+    return ParameterLayout(weights.names, weights.shapes)
 
 
 def _wire_dtype(dtype: str) -> np.dtype[Any]:
@@ -210,11 +249,11 @@ def _wire_dtype(dtype: str) -> np.dtype[Any]:
 
 def _looked_at(weights: PolicyWeights, wire: np.dtype[Any]) -> tuple[str, bool | None]:
     """Return the digest of the buffer and whether its numbers are finite; None: they are still to be looked at."""
-    if weights.encoder_strides.size and wire == np.float32:
-        from common.policies.fused_check import digest_and_finite  # LLVM: only policies with camera pay for it
+    if _is_large(weights.encoder_strides, wire):
+        from common.policies.fused_check import digest_and_finite
 
         return digest_and_finite(weights.buffer)
-    return _digest(weights.buffer), None
+    return _digest([weights.buffer]), None
 
 
 def _all_finite(values: npt.NDArray[Any]) -> bool:
@@ -225,6 +264,23 @@ def _all_finite(values: npt.NDArray[Any]) -> bool:
     return bool(np.isfinite(values).all())
 
 
-def _digest(buffer: npt.NDArray[np.uint8]) -> str:
+def _digest(pieces: Sequence[npt.NDArray[Any]]) -> str:
     # Against accidents, not against forgers: twenty times as fast as a cryptographic hash.
-    return xxhash.xxh3_128_hexdigest(buffer.data)
+    digest = xxhash.xxh3_128()
+    for piece in pieces:
+        digest.update(piece.data)
+    return digest.hexdigest()
+
+
+def _seal(encoder_strides: Sequence[int], wire: np.dtype[Any]) -> Seal | None:
+    """Return what takes the digest while the parameters are copied; None: it is to be taken before."""
+    if not _is_large(encoder_strides, wire):
+        return None
+    from common.policies.fused_copy import copy_and_digest
+
+    return Seal("digest", copy_and_digest)
+
+
+def _is_large(encoder_strides: Sized, wire: np.dtype[Any]) -> bool:
+    """Return whether policies are so large that LLVM is imported for them: those with camera, unless halved."""
+    return len(encoder_strides) > 0 and wire == np.float32

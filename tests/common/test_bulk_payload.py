@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
+
 import msgpack
 import numpy as np
 import pytest
 
-from common.bulk_payload import ALIGNMENT, as_aligned, pack_bulk, unpack_bulk
+from common.bulk_payload import ALIGNMENT, Seal, as_aligned, pack_bulk, unpack_bulk
 
 
 def pack(values, *pieces, shape=None):
@@ -39,6 +41,33 @@ def test_the_bytes_begin_at_a_multiple_of_four_and_are_a_view(length):
 def test_an_array_without_elements_is_packed_too():
     payload = pack({}, np.zeros((0, 4), np.uint8), shape=[0, 4])
     assert unpack_bulk(payload) == {"data": ["|u1", [0, 4], b""]} == msgpack.unpackb(payload)
+
+
+def sum_of_copied(pieces, size, target):
+    """Copy, and return the sum of all bytes in three digits."""
+    joined = b"".join(piece.tobytes() for piece in pieces)
+    assert len(joined) == size
+    ctypes.memmove(target, joined, size)
+    return f"{sum(joined):03}"
+
+
+@pytest.mark.parametrize("length", range(9))
+@pytest.mark.parametrize("order", [("seal", "text"), ("text", "seal")])
+def test_a_seal_is_made_while_the_pieces_are_copied_and_changes_nothing_else(length, order):
+    pieces = [np.array([1, 2], np.uint8), np.zeros(0, np.uint8), np.array([[200], [100]], np.uint8)]
+    # The text looks like the placeholder.
+    values = {name: {"seal": "000", "text": "0" * length}[name] for name in order}
+    sealed = pack_bulk(values, "data", "|u1", [4], pieces, vars, Seal("seal", sum_of_copied))
+    assert type(sealed) is bytes
+    assert sealed == pack_bulk(values | {"seal": "303"}, "data", "|u1", [4], pieces, vars)
+
+
+@pytest.mark.parametrize("text", ["0000", "00", ""])
+def test_a_seal_of_another_length_is_refused(text):
+    with pytest.raises(ValueError, match=f"seal: expected a text as long as '{text}', got b'006'"):
+        pack_bulk(
+            {"seal": text}, "data", "|u1", [3], [np.array([1, 2, 3], np.uint8)], vars, Seal("seal", sum_of_copied)
+        )
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgpack
 import numpy as np
 import pytest
 import xxhash
@@ -12,12 +13,21 @@ from common.codec import decode, encode
 from common.errors import MessageError
 from common.messages import PolicyWeights
 from common.policies import policy_from_weights
-from common.policies.weights import initial_parameters, pack_weights, parameter_shapes, unpack_weights
+from common.policies.weights import (
+    encode_weights,
+    initial_parameters,
+    pack_weights,
+    parameter_layout,
+    parameter_shapes,
+    prepare_encoding,
+    unpack_weights,
+)
 from tests.reference.tasks import make_spec
 
 SPEC = make_spec((32, 36, 3))
 STRIDES = (2, 2, 1, 1)
-SHAPES = parameter_shapes(SPEC, 16, STRIDES)
+LAYOUT = parameter_layout(SPEC, 16, STRIDES)
+SHAPES = LAYOUT.by_name
 
 
 def make_parameters():
@@ -66,7 +76,7 @@ def test_only_the_head_differs_between_zero_and_default_initialisation():
 
 def test_float32_arrives_to_the_last_bit_through_the_codec():
     parameters = make_parameters()
-    arrived = unpack_weights(decode(encode(make_weights()), PolicyWeights), SHAPES)
+    arrived = unpack_weights(decode(encode(make_weights()), PolicyWeights), LAYOUT)
     assert list(arrived) == list(parameters)
     for name, values in parameters.items():
         np.testing.assert_array_equal(arrived[name], values)
@@ -75,7 +85,7 @@ def test_float32_arrives_to_the_last_bit_through_the_codec():
 def test_float16_halves_the_bytes_and_keeps_values_close():
     parameters, weights = make_parameters(), make_weights(dtype="float16")
     assert weights.buffer.nbytes * 2 == make_weights().buffer.nbytes
-    for name, values in unpack_weights(weights, SHAPES).items():
+    for name, values in unpack_weights(weights, LAYOUT).items():
         assert values.dtype == np.float32
         np.testing.assert_allclose(values, parameters[name], rtol=2**-11, atol=1e-7)
 
@@ -85,12 +95,12 @@ def test_a_changed_byte_is_refused_by_the_digest():
     buffer = weights.buffer.copy()
     buffer[1000] ^= 1
     with pytest.raises(MessageError, match="digest"):
-        unpack_weights(replace(weights, buffer=buffer), SHAPES)
+        unpack_weights(replace(weights, buffer=buffer), LAYOUT)
 
 
 def test_weights_of_another_network_are_refused_naming_what_differs():
     with pytest.raises(MessageError, match=r"actor.0.bias.*\[32\].*\[16\]"):
-        unpack_weights(make_weights(), parameter_shapes(SPEC, 32, STRIDES))
+        unpack_weights(make_weights(), parameter_layout(SPEC, 32, STRIDES))
     with pytest.raises(MessageError, match="encoder"):
         policy_from_weights(make_spec(), make_weights())
 
@@ -99,7 +109,7 @@ def test_a_buffer_of_the_wrong_length_is_refused():
     weights = make_weights()
     values = weights.buffer.view(np.float32)[:-1]
     with pytest.raises(MessageError, match="bytes"):
-        unpack_weights(with_buffer(weights, values), SHAPES)
+        unpack_weights(with_buffer(weights, values), LAYOUT)
 
 
 @pytest.mark.parametrize("at", [0, 5000, -1])
@@ -108,7 +118,7 @@ def test_a_changed_bit_is_refused_wherever_it_is(at):
     buffer = weights.buffer.copy()
     buffer[at] ^= 1
     with pytest.raises(MessageError, match=f"expected digest {weights.digest}, got"):
-        unpack_weights(replace(weights, buffer=buffer), SHAPES)
+        unpack_weights(replace(weights, buffer=buffer), LAYOUT)
 
 
 @pytest.mark.parametrize("bits", [0x7F800000, 0xFF800000, 0x7FC00000, 0xFFC00001], ids=["inf", "-inf", "nan", "-nan"])
@@ -118,13 +128,13 @@ def test_a_number_that_is_not_finite_is_refused_although_its_digest_fits(bits, a
     values = np.frombuffer(weights.buffer.tobytes(), np.uint32).copy()
     values[at] = bits
     with pytest.raises(MessageError, match="finite"):
-        unpack_weights(with_buffer(weights, values), SHAPES)
+        unpack_weights(with_buffer(weights, values), LAYOUT)
 
 
 def test_finite_numbers_whose_squares_are_not_are_accepted():
     parameters = make_parameters()
     parameters["actor.1.bias"][0] = 3e38
-    assert unpack_weights(make_weights(parameters), SHAPES)["actor.1.bias"][0] == np.float32(3e38)
+    assert unpack_weights(make_weights(parameters), LAYOUT)["actor.1.bias"][0] == np.float32(3e38)
 
 
 def test_the_message_is_a_copy_of_the_parameters():
@@ -134,6 +144,72 @@ def test_the_message_is_a_copy_of_the_parameters():
     for values in parameters.values():
         values += 1.0  # as a learner goes on
     np.testing.assert_array_equal(weights.buffer, before)
+
+
+def wide_parameters():
+    """A policy with layers large enough to be copied and taken in at once, not all of them in one piece of memory."""
+    parameters = initial_parameters(SPEC, 200, STRIDES, np.random.default_rng(0), zero_initialised_head=False)
+    parameters["actor.1.weight"] = np.asfortranarray(parameters["actor.1.weight"])
+    parameters["actor.0.bias"] = np.repeat(parameters["actor.0.bias"], 2)[::2]
+    return parameters
+
+
+def encode_wide(parameters, **changes):
+    arguments = {"version": 3, "updates": 150, "algorithm": "sac", "hidden_size": 200, "encoder_strides": STRIDES}
+    return encode_weights(parameters, **(arguments | {"dtype": "float32"} | changes))
+
+
+def test_the_digest_taken_while_copying_is_in_the_payload_that_any_encoder_would_make():
+    parameters = wide_parameters()
+    values = b"".join(values.tobytes() for values in parameters.values())
+    weights = PolicyWeights(
+        version=3,
+        updates=150,
+        algorithm="sac",
+        hidden_size=200,
+        encoder_strides=np.array(STRIDES, np.int64),
+        names=list(parameters),
+        shapes=[list(values.shape) for values in parameters.values()],
+        dtype="float32",
+        buffer=np.frombuffer(values, np.uint8),
+        digest=xxhash.xxh3_128_hexdigest(values),
+    )
+    assert decode(encode_wide(parameters), PolicyWeights).digest == weights.digest
+    assert msgpack.unpackb(encode_wide(parameters)) == msgpack.unpackb(encode(weights))
+    assert policy_from_weights(SPEC, decode(encode_wide(parameters), PolicyWeights, SPEC.dimensions)).version == 3
+
+
+def test_a_number_that_is_not_finite_is_sent_with_a_digest_that_fits_and_refused_by_the_receiver():
+    parameters = wide_parameters()
+    parameters["actor.1.weight"][7, 8] = np.nan
+    with pytest.raises(MessageError, match="expected finite numbers"):
+        policy_from_weights(SPEC, decode(encode_wide(parameters), PolicyWeights))
+
+
+@pytest.mark.parametrize("changes", [{"encoder_strides": ()}, {"dtype": "float16"}])
+def test_nothing_is_compiled_for_policies_without_camera_or_in_half_precision(changes, monkeypatch):
+    monkeypatch.setattr("common.policies.fused_copy.copy_and_digest", None)
+    monkeypatch.setattr("common.policies.xxh3.compile_take_in_and_copy", None)
+    prepare_encoding(changes.get("encoder_strides", STRIDES), changes.get("dtype", "float32"))
+    weights = decode(encode_wide(wide_parameters(), **changes), PolicyWeights)
+    assert weights.digest == xxhash.xxh3_128_hexdigest(weights.buffer.tobytes())
+
+
+def test_parameters_may_come_in_another_order():
+    parameters = make_parameters()
+    turned = dict(reversed(parameters.items()))
+    arrived = unpack_weights(make_weights(turned), LAYOUT)
+    assert list(arrived) == list(turned)
+    for name, values in parameters.items():
+        np.testing.assert_array_equal(arrived[name], values)
+
+
+def test_names_that_come_twice_or_without_shapes_are_refused():
+    weights = make_weights()
+    twice = replace(weights, names=[*weights.names, "actor.0.bias"], shapes=[*weights.shapes, [16]])
+    for changed in (twice, replace(weights, names=[*weights.names, "x"]), replace(weights, shapes=weights.shapes[:-1])):
+        with pytest.raises(MessageError, match="another network"):
+            unpack_weights(changed, LAYOUT)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float16"])
@@ -150,7 +226,7 @@ def test_the_values_begin_at_a_multiple_of_four_bytes_however_long_the_other_fie
         )
         assert weights.buffer.ctypes.data % 4 == 0
         assert not weights.buffer.flags.owndata
-        unpack_weights(weights, SHAPES)
+        unpack_weights(weights, LAYOUT)
 
 
 def test_weights_are_read_wherever_their_bytes_begin():
@@ -158,7 +234,7 @@ def test_weights_are_read_wherever_their_bytes_begin():
     for offset in range(1, 4):
         shifted = np.zeros(weights.buffer.size + offset, np.uint8)[offset:]
         shifted[:] = weights.buffer
-        for name, values in unpack_weights(replace(weights, buffer=shifted), SHAPES).items():
+        for name, values in unpack_weights(replace(weights, buffer=shifted), LAYOUT).items():
             assert values.flags.aligned
             np.testing.assert_array_equal(values, make_parameters()[name])
 
@@ -172,7 +248,7 @@ def test_a_value_too_large_for_float16_is_refused_by_the_sender():
 
 def test_an_unknown_number_format_is_refused():
     with pytest.raises(MessageError, match="bfloat16"):
-        unpack_weights(replace(make_weights(), dtype="bfloat16"), SHAPES)
+        unpack_weights(replace(make_weights(), dtype="bfloat16"), LAYOUT)
 
 
 @pytest.mark.parametrize("strides", [[], [2, 2, 0, 1], [2, 2, 2, 2, 2, 2]])
