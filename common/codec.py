@@ -236,8 +236,11 @@ def _nested_list_decoder(element: Decoder) -> Decoder:
     lists, integers = {list}, {int}
 
     def decode_lists(value: Any, where: str, sizes: Sizes) -> list[Any]:
-        are_lists = type(value) is list and lists.issuperset(map(type, value))
-        if are_lists and integers.issuperset(map(type, chain.from_iterable(value))):
+        if (
+            type(value) is list
+            and lists.issuperset(map(type, value))
+            and integers.issuperset(map(type, chain.from_iterable(value)))
+        ):
             return value
         return [element(item, where, sizes) for item in _instance(value, list, where)]
 
