@@ -17,9 +17,9 @@ FEATURES = 2 * CHANNELS
 
 def cropped_shape(spec: TaskSpec) -> tuple[int, int, int]:
     """Return (height, width, S * C) of the stacked frames after the RAD crop (thesis 3.6)."""
-    sizes = spec.dimensions
+    height, width, channels = spec.frame_shape.tolist()
     margin_y, margin_x = spec.crop_margin.tolist()
-    return sizes.H - 2 * margin_y, sizes.W - 2 * margin_x, sizes.S * sizes.C
+    return height - 2 * margin_y, width - 2 * margin_x, spec.frame_stack * channels
 
 
 def map_size(height: int, width: int, strides: Sequence[int]) -> tuple[int, int]:

@@ -17,6 +17,7 @@ from common.policies.weights import (
     pending_actions_of,
     unpack_weights,
 )
+from common.policies.xxh3 import compile_take_in
 
 __all__ = [
     "ChosenAction",
@@ -54,8 +55,6 @@ def initial_policy(
         zero_initialised_head=zero_initialised_head,
     )
     if spec.has_camera:
-        from common.policies.xxh3 import compile_take_in
-
         compile_take_in()  # compiled now, not when the first policy comes
     return _policy(spec, parameters, 0, encoder_strides)
 

@@ -32,11 +32,15 @@ from common.codec import decode, encode_gathered
 from common.errors import MessageError
 from common.messages import Float32Array, PolicyWeights, TaskSpec
 from common.networks.sizes import CHANNELS, FEATURES, KERNEL
+from common.policies.fused_check import digest_and_finite
+from common.policies.fused_copy import copy_and_digest
+from common.policies.xxh3 import compile_take_in_and_copy
 
 _FIRST_WEIGHT = "actor.0.weight"
 _HEAD_WEIGHT, _HEAD_BIAS = "actor.2.weight", "actor.2.bias"
 _NO_DIGEST = "0" * 32
 """As long as a digest."""
+_SEAL = Seal("digest", copy_and_digest)
 _WIRE_DTYPES: dict[str, np.dtype[Any]] = {"float32": np.dtype("<f4"), "float16": np.dtype("<f2")}
 
 
@@ -62,8 +66,8 @@ class ParameterLayout:
 
 def parameter_layout(spec: TaskSpec, hidden_size: int, encoder_strides: Sequence[int]) -> ParameterLayout:
     """Return what a policy's parameters are."""
-    sizes = spec.dimensions
-    return _layout(sizes.A, sizes.P, sizes.S * sizes.C, hidden_size, len(encoder_strides))
+    channels = spec.frame_stack * int(spec.frame_shape[2])
+    return _layout(len(spec.action_low), len(spec.proprioception_low), channels, hidden_size, len(encoder_strides))
 
 
 def parameter_shapes(spec: TaskSpec, hidden_size: int, encoder_strides: Sequence[int]) -> Mapping[str, list[int]]:
@@ -156,7 +160,7 @@ def encode_weights(
             if not np.isfinite(piece).all():
                 raise MessageError(f"policy weights after {updates} updates: {name} has no finite numbers in {dtype}")
         pieces.append(piece)
-    seal = _seal(encoder_strides, wire)
+    seal = _SEAL if _is_large(encoder_strides, wire) else None
     fields = {
         "version": version,
         "updates": updates,
@@ -174,8 +178,6 @@ def encode_weights(
 def prepare_encoding(encoder_strides: Sequence[int], dtype: str) -> None:
     """Compile what :func:`encode_weights` needs, not when the first policy is pushed."""
     if _is_large(encoder_strides, _wire_dtype(dtype)):
-        from common.policies.xxh3 import compile_take_in_and_copy
-
         compile_take_in_and_copy()
 
 
@@ -250,8 +252,6 @@ def _wire_dtype(dtype: str) -> np.dtype[Any]:
 def _looked_at(weights: PolicyWeights, wire: np.dtype[Any]) -> tuple[str, bool | None]:
     """Return the digest of the buffer and whether its numbers are finite; None: they are still to be looked at."""
     if _is_large(weights.encoder_strides, wire):
-        from common.policies.fused_check import digest_and_finite
-
         return digest_and_finite(weights.buffer)
     return _digest([weights.buffer]), None
 
@@ -270,15 +270,6 @@ def _digest(pieces: Sequence[npt.NDArray[Any]]) -> str:
     for piece in pieces:
         digest.update(piece.data)
     return digest.hexdigest()
-
-
-def _seal(encoder_strides: Sequence[int], wire: np.dtype[Any]) -> Seal | None:
-    """Return what takes the digest while the parameters are copied; None: it is to be taken before."""
-    if not _is_large(encoder_strides, wire):
-        return None
-    from common.policies.fused_copy import copy_and_digest
-
-    return Seal("digest", copy_and_digest)
 
 
 def _is_large(encoder_strides: Sized, wire: np.dtype[Any]) -> bool:

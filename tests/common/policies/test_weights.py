@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import xxhash
 
+from common.bulk_payload import Seal
 from common.codec import decode, encode
 from common.errors import MessageError
 from common.messages import PolicyWeights
@@ -188,8 +189,8 @@ def test_a_number_that_is_not_finite_is_sent_with_a_digest_that_fits_and_refused
 
 @pytest.mark.parametrize("changes", [{"encoder_strides": ()}, {"dtype": "float16"}])
 def test_nothing_is_compiled_for_policies_without_camera_or_in_half_precision(changes, monkeypatch):
-    monkeypatch.setattr("common.policies.fused_copy.copy_and_digest", None)
-    monkeypatch.setattr("common.policies.xxh3.compile_take_in_and_copy", None)
+    monkeypatch.setattr("common.policies.weights._SEAL", Seal("digest", None))
+    monkeypatch.setattr("common.policies.weights.compile_take_in_and_copy", None)
     prepare_encoding(changes.get("encoder_strides", STRIDES), changes.get("dtype", "float32"))
     weights = decode(encode_wide(wide_parameters(), **changes), PolicyWeights)
     assert weights.digest == xxhash.xxh3_128_hexdigest(weights.buffer.tobytes())
