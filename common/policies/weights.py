@@ -59,6 +59,11 @@ class ParameterLayout:
         return dict(zip(self.names, self.shapes, strict=True))
 
     @cached_property
+    def size(self) -> int:
+        """Count of numbers."""
+        return sum(math.prod(shape) for shape in self.shapes)
+
+    @cached_property
     def record(self) -> np.dtype[np.void]:
         """A buffer's type in NumPy: with it, a parameter is found without counting."""
         return np.dtype([(name, np.float32, tuple(shape)) for name, shape in self.by_name.items()])
@@ -218,11 +223,9 @@ def unpack_weights(weights: PolicyWeights, expected: ParameterLayout) -> dict[st
     layout = expected
     if weights.names != expected.names or weights.shapes != expected.shapes:
         layout = _in_another_order(weights, expected)
-    size = layout.record.itemsize // 4
-    if weights.buffer.nbytes != size * wire.itemsize:
-        raise MessageError(
-            f"policy weights {weights.version}: expected {size * wire.itemsize} bytes, got {weights.buffer.nbytes}"
-        )
+    size = layout.size * wire.itemsize
+    if weights.buffer.nbytes != size:
+        raise MessageError(f"policy weights {weights.version}: expected {size} bytes, got {weights.buffer.nbytes}")
     flat = as_aligned(weights.buffer.view(wire)).astype(np.float32, copy=False)
     if not (_all_finite(flat) if is_finite is None else is_finite):
         raise MessageError(f"policy weights {weights.version}: expected finite numbers, got NaN or infinity")

@@ -113,6 +113,20 @@ def test_a_buffer_of_the_wrong_length_is_refused():
         unpack_weights(with_buffer(weights, values), LAYOUT)
 
 
+def test_a_network_larger_than_any_memory_is_refused_by_its_bytes():
+    huge = parameter_layout(SPEC, 2**40, STRIDES)
+    weights = replace(make_weights(), names=huge.names, shapes=huge.shapes, hidden_size=2**40)
+    with pytest.raises(MessageError, match=f"expected {4 * huge.size} bytes"):
+        policy_from_weights(SPEC, weights)
+
+
+def test_the_arrays_are_views_of_the_buffer():
+    weights = make_weights()
+    for values in unpack_weights(weights, LAYOUT).values():
+        assert np.shares_memory(values, weights.buffer)
+        assert not values.flags.writeable
+
+
 @pytest.mark.parametrize("at", [0, 5000, -1])
 def test_a_changed_bit_is_refused_wherever_it_is(at):
     weights = make_weights()
