@@ -103,7 +103,7 @@ def compile_take_in_and_copy() -> TakeInAndCopy:
     """Compile a pass that copies."""
     address, integer = ctypes.c_void_p, ctypes.c_int64
     # It keeps Python's lock, .1 ms for a policy: it would have to be given away several times for each, and whoever has
-    # given it away waits for it, up to 5 ms, beside a thread that is busy with Python (:mod:`.sparse_layer`).
+    # given it away waits for it, up to 5 ms, beside a thread busy with Python (see common.policies.sparse_layer).
     prototype = ctypes.PYFUNCTYPE(None, address, integer, integer, ctypes.POINTER(Digest), address)
     return cast("TakeInAndCopy", compile_function(_text(copies=True), "take_in", prototype))
 
