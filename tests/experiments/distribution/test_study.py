@@ -117,7 +117,7 @@ def test_runs_of_other_settings_are_not_mixed_in(tmp_path, capsys, name, key, va
     assert values[name][key] != value
     settings.write_text(json.dumps({**values, name: {**values[name], key: value}}), encoding="utf-8")
     assert run(tmp_path, HAND_MADE, hand_made) == 1
-    assert f"{name}: " in capsys.readouterr().err
+    assert f"{name}, {key}: {value!r} there, now " in capsys.readouterr().err
 
 
 def test_a_run_that_ended_early_is_no_result(tmp_path, monkeypatch):
