@@ -60,7 +60,7 @@ class Study(Generic[AJob]):
             for name in remove_half_finished(runs, self._jobs.values(), record.rows):
                 console.line(f"{name} was interrupted: removed, it begins again")
             console.line(f"{self._finished(record)} of {len(self._jobs)} jobs are finished; results go to {out}")
-            with WorkerPool(do, {**self._settings, "runs": str(runs)}, workers) as pool:
+            with WorkerPool(do, {**self._settings, "runs": str(runs)}, workers, pinned=True) as pool:
                 run_grid(
                     record,
                     list(self._jobs),

@@ -36,3 +36,13 @@ def signal_immunity(settings, key):
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         os.kill(os.getpid(), number)
     return {"value": key[1]}
+
+
+def cores(settings, key):
+    """Which cores its process may run on."""
+    return {"cores": sorted(os.sched_getaffinity(0)), "process": os.getpid()}
+
+
+def cores_or_death(settings, key):
+    """The same, but on the key with 3 the process is killed."""
+    return die_at_three(settings, key) | cores(settings, key)

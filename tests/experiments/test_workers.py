@@ -1,6 +1,7 @@
 """Processes that do jobs, and what happens when one does not."""
 
 import multiprocessing
+import os
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -25,6 +26,25 @@ def test_each_job_is_done_once_by_a_process_that_is_not_this_one(tmp_path):
     ]
     assert len({path.read_text() for path in tmp_path.iterdir()}) == 2
     assert not multiprocessing.active_children()
+
+
+def test_each_pinned_process_stays_on_a_core_of_its_own_also_one_that_replaces_another():
+    cores = sorted(os.sched_getaffinity(0))[:2]
+    with WorkerPool(fake_jobs.cores_or_death, {}, len(cores), pinned=True) as pool:
+        found = [outcome for outcome in pool.run(JOBS) if isinstance(outcome, FinishedJob)]
+        assert {tuple(outcome.row["cores"]) for outcome in found} <= {(core,) for core in cores}
+        # Those that are there now, one of them in the place of the one that died.
+        now = [outcome for outcome in pool.run([("squares", 10 + core) for core in cores]) if outcome is not None]
+    assert sorted(outcome.row["cores"] for outcome in now) == [[core] for core in cores]
+
+
+@pytest.mark.parametrize("pinned", [False, True])
+def test_processes_without_a_core_of_their_own_run_where_there_is_room(pinned):
+    every_core = sorted(os.sched_getaffinity(0))
+    workers = len(every_core) + 1 if pinned else 1
+    with WorkerPool(fake_jobs.cores, {}, workers, pinned=pinned) as pool:
+        found = [outcome for outcome in pool.run(JOBS) if outcome is not None]
+    assert [outcome.row["cores"] for outcome in found] == [every_core] * len(JOBS)
 
 
 def test_a_process_that_dies_costs_its_job_only():
