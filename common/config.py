@@ -148,7 +148,7 @@ def _checked(hint: Any, value: Any, item: dataclasses.Field[Any], where: str) ->
     metadata = item.metadata
     if metadata.get("choices") and value not in metadata["choices"]:
         expected = ", ".join(metadata["choices"])
-        raise ConfigError(f"{where} = {value!r}: expected one of {expected}{_hint(value, metadata['choices'])}")
+        raise ConfigError(f"{where} = {value!r}: expected one of {expected}{_suggestion(value, metadata['choices'])}")
     low, high = metadata.get("low"), metadata.get("high")
     if isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f"{where} = {value!r}: expected a finite number")
@@ -173,5 +173,9 @@ def _type_name(hint: Any) -> str:
 
 def _hint(name: Any, known: Iterable[str]) -> str:
     known = list(known)
-    close = difflib.get_close_matches(str(name), known, 1)
-    return f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(known)}"
+    return _suggestion(name, known) or f"; known: {', '.join(known)}"
+
+
+def _suggestion(name: Any, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(str(name), list(known), 1)
+    return f"; did you mean {close[0]!r}?" if close else ""

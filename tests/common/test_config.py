@@ -123,6 +123,11 @@ def test_a_wrong_value_is_named_with_what_was_expected(tmp_path, line, expected)
     assert str(tmp_path / "arm.toml") in error
 
 
+def test_a_wrong_choice_like_no_other_names_the_choices_once(tmp_path):
+    error = refused(tmp_path, '[arm]\nname = "left"\ntouch = "h264"\n')
+    assert error.endswith("touch = 'h264': expected one of soft, stiff")
+
+
 def test_a_missing_setting_is_named(tmp_path):
     assert "[arm]: name is missing; expected text" in refused(tmp_path, "[arm]\njoints = 2\n")
 
