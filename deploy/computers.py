@@ -52,6 +52,11 @@ def check_pair(addresses: Mapping[Host, str]) -> None:
             raise ConfigError(
                 f"no address for {host!r}: expected it in the mode file's [endpoints] or as --endpoint {host}=ADDRESS"
             )
+    if len(set(addresses.values())) < len(HOSTS):
+        raise ConfigError(
+            f"endpoints local = remote = {addresses[HOSTS[0]]}: expected the addresses of two computers; to try both "
+            "sides on one, give 127.0.0.1 and 127.0.0.2"
+        )
     loopback = [host for host in HOSTS if ipaddress.IPv4Address(addresses[host]).is_loopback]
     if len(loopback) == 1:
         inner, outer = loopback[0], other_host(loopback[0])

@@ -133,16 +133,24 @@ def _side(options: argparse.Namespace, placement: Placement) -> Side:
         raise ConfigError(f"--host {host}: in {placement.mode} all services are on one computer; leave --host out")
     if options.write_config:
         raise ConfigError("--write-config: expected without --host, for the files name all services")
-    addresses = dict(placement.addresses)
-    for endpoint in options.endpoint:
-        name, equals, address = endpoint.partition("=")
-        if not equals:
-            raise ConfigError(f"--endpoint {endpoint}: expected HOST=ADDRESS, for example local=192.168.1.10")
-        addresses[name] = checked_address(name, address, f"--endpoint {endpoint}")
+    addresses = {**placement.addresses, **_endpoints(options.endpoint)}
     check_pair(addresses)
     check_is_ours(host, addresses[host])
     run_id = options.run_id or (make_run_id(datetime.now()) if host == HOSTS[0] else None)
     return Side(host, addresses, run_id, options.wait)
+
+
+def _endpoints(texts: Sequence[str]) -> dict[Host, str]:
+    """The addresses in ``HOST=ADDRESS``, one for a host."""
+    addresses: dict[Any, str] = {}
+    for endpoint in texts:
+        name, equals, address = endpoint.partition("=")
+        if not equals:
+            raise ConfigError(f"--endpoint {endpoint}: expected HOST=ADDRESS, for example local=192.168.1.10")
+        if name in addresses:
+            raise ConfigError(f"--endpoint {endpoint}: expected once for each host, got {name}={addresses[name]} too")
+        addresses[name] = checked_address(name, address, f"--endpoint {endpoint}")
+    return addresses
 
 
 def choose_network(
@@ -237,7 +245,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="only write a configuration for each service to DIR, and print the four commands",
     )
-    parser.add_argument("--base-port", type=int, metavar="N", help="first of the run's 8 TCP ports (--host: 12)")
+    parser.add_argument(
+        "--base-port",
+        type=int,
+        metavar="N",
+        help="first of the run's TCP ports: 8 of its services, with --host 4 more of the two launchers",
+    )
     parser.add_argument("--run-id", metavar="ID", help="name of the run in its messages (default: date and chance)")
     computers = parser.add_argument_group(
         "two computers", "the same command on both, but for --host and --run-dir; see docs/two-computers.md"

@@ -32,6 +32,11 @@ def test_a_loopback_address_reaches_no_other_computer(local_is_inner: bool) -> N
     check_pair({"local": "127.0.0.1", "remote": "127.0.0.2"})
 
 
+def test_two_computers_have_two_addresses() -> None:
+    with pytest.raises(ConfigError, match=r"local = remote = 10\.0\.0\.1: expected the addresses of two computers"):
+        check_pair({"local": "10.0.0.1", "remote": "10.0.0.1"})
+
+
 def test_an_address_of_another_computer_is_refused() -> None:
     check_is_ours("local", "127.0.0.1")
     # 192.0.2.0/24 is for documentation: no computer has it.
