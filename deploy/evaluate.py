@@ -25,8 +25,10 @@ from common.messages import Float32Array, PolicyWeights, UInt8Array
 from common.pending_actions import PendingActions, observed_spec
 from common.policies import Observation, Policy, pending_actions_of, policy_from_weights
 from common.record import write_atomically
-from common.topics import ROBOT_BRIDGE
+from common.topics import LEARNER, ROBOT_BRIDGE
 from deploy.console import Console
+from deploy.mirror import BRIDGE_CONFIGURATION
+from deploy.record_folders import find_file
 from deploy.stop_signals import INTERRUPTED, StopSignals
 from services.robot_bridge.bookkeeping import STEP_REWARD_IN_RESET, Ledger
 from services.robot_bridge.config import RobotBridgeConfig
@@ -170,17 +172,15 @@ def load_run(run_dir: Path, config_path: Path | None, seed: int) -> tuple[Evalua
     """
     if not run_dir.is_dir():
         raise ConfigError(f"{run_dir}: no such run directory")
-    path = config_path or run_dir / "config" / f"{ROBOT_BRIDGE}.toml"
-    if config_path is None and not path.exists():
-        raise ConfigError(f"{path} is missing; name the bridge's configuration with --config FILE")
+    path = config_path or find_file(
+        run_dir, BRIDGE_CONFIGURATION, ROBOT_BRIDGE, "name the bridge's configuration with --config FILE"
+    )
     config = load_config(RobotBridgeConfig, path)
     rng = np.random.default_rng(seed)
     task = load_task(config.task.name, config.task.preset, config.task.overrides, config.tasks.rows, rng=rng)
-    policy_path = run_dir / "policy.msgpack"
+    policy_path = find_file(run_dir, "policy.msgpack", LEARNER, "the learner has not saved a policy")
     try:
         weights = decode(policy_path.read_bytes(), PolicyWeights)
-    except FileNotFoundError:
-        raise ConfigError(f"{policy_path} is missing: the learner has not saved a policy") from None
     except MessageError as error:
         raise ConfigError(f"{policy_path} cannot be used: {error}") from error
     encoding = FrameEncoding(config.robot_bridge.encoding)
@@ -226,9 +226,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR", help="folder of the run's record")
     parser.add_argument("--episodes", type=int, default=100, metavar="N", help="default: %(default)s")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the start states (default: %(default)s)")
-    parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="the bridge's configuration (default: the one in RUN_DIR)"
-    )
+    parser.add_argument("--config", type=Path, metavar="FILE", help="the bridge's configuration (default: RUN_DIR's)")
     options = parser.parse_args(arguments)
     if options.episodes < 1:
         parser.error(f"--episodes {options.episodes}: expected at least 1")

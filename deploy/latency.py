@@ -15,8 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from common.errors import ConfigError, RelodError
+from common.topics import ROBOT_BRIDGE
 from deploy.action_age import AGE, QUANTILES, WAYS, ActionAges
 from deploy.latency_picture import DRAWN, RunBars, draw_latency
+from deploy.record_folders import find_file
 from deploy.run_file import RunFile
 from services.robot_bridge.action_age import PARTS
 
@@ -32,6 +34,8 @@ class RunLatency:
     """Mode and network; empty where the record does not know them."""
     task: str
     ages: ActionAges
+    copy: Path | None = None
+    """Folder of copies that the ages were read from, where the robot's computer was another one."""
 
     @classmethod
     def read(cls, run_dir: Path) -> RunLatency:
@@ -42,12 +46,14 @@ class RunLatency:
         """
         if not run_dir.is_dir():
             raise ConfigError(f"{run_dir}: no such run directory")
-        ages = ActionAges.read(run_dir)
+        otherwise = "expected the run directory of a run in which actions arrived"
+        folder = find_file(run_dir, "actions.csv", ROBOT_BRIDGE, otherwise).parent
+        ages, copy = ActionAges.read(folder), None if folder == run_dir else folder
         try:
             run = RunFile.read(run_dir)
         except ConfigError:  # of a run that was put together by hand
-            return cls(run_dir, "", "", ages)
-        return cls(run_dir, f"{run.mode}, network {Path(run.network).stem}", run.task, ages)
+            return cls(run_dir, "", "", ages, copy)
+        return cls(run_dir, f"{run.mode}, network {Path(run.network).stem}", run.task, ages, copy)
 
 
 def table(run: RunLatency) -> str:
@@ -65,7 +71,8 @@ def table(run: RunLatency) -> str:
         f"  {' and '.join(WAYS)} may be off by {p50:.3f} ms (p50; at most {largest:.3f} ms), one too long and the "
         "other too short: the error bound of the clocks' offset"
     )
-    lines.append(f"  {len(ages.age)} applied actions{_left_out(ages)}")
+    where = f"; as far as they were copied to {run.copy}" if run.copy else ""
+    lines.append(f"  {len(ages.age)} applied actions{_left_out(ages)}{where}")
     return "\n".join(lines)
 
 
@@ -109,6 +116,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     picture = options.picture or options.run_dirs[0] / PICTURE
     try:
+        if picture.suffix.lower() != ".png":
+            raise ConfigError(f"--picture {picture}: expected a name that ends in .png, for that is what is written")
         runs = [RunLatency.read(run_dir) for run_dir in options.run_dirs]
         draw(runs, picture)
     except RelodError as error:

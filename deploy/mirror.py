@@ -18,9 +18,14 @@ CHUNK_BYTES = 256 * 1024
 HOSTS_FOLDER = "hosts"
 RING_COUNTS = "ring.json"
 """What the summary wants to know of the experience ring, which itself is too large to be copied."""
+BRIDGE_CONFIGURATION = "config/robot_bridge.toml"
+"""What an evaluation of the policy, on the computer that has learnt it, wants to know of the task."""
+OUTDATED = "outdated"
+"""Says, in the folder of copies, that the services there went on when nobody copied any more."""
 
 _TABLES = ("episodes.csv", "actions.csv")
 """They only grow, but for columns that are new."""
+_SINGLE = (*_TABLES, RING_COUNTS, BRIDGE_CONFIGURATION)
 _NAMES = re.compile(r"parts/(robot_bridge|actor|replay|learner)-\d{1,20}\.json", re.ASCII)
 
 Fetch = Callable[[str, int], bytes | None]
@@ -29,12 +34,12 @@ Fetch = Callable[[str, int], bytes | None]
 
 def is_shared(name: str) -> bool:
     """True for the files that the other computer may read here, and that are taken from there."""
-    return name in (*_TABLES, RING_COUNTS) or _NAMES.fullmatch(name) is not None
+    return name in _SINGLE or _NAMES.fullmatch(name) is not None
 
 
 def shared_files(run_dir: Path) -> dict[str, int]:
     """Return what there is for the other computer: name -> bytes."""
-    paths = [run_dir / name for name in (*_TABLES, RING_COUNTS)] + sorted(run_dir.glob("parts/*.json"))
+    paths = [run_dir / name for name in _SINGLE] + sorted(run_dir.glob("parts/*.json"))
     found = {}
     for path in paths:
         name = path.relative_to(run_dir).as_posix()
@@ -71,11 +76,16 @@ class Mirror:
         """
         return all(self._update(name, size, whole) for name, size in files.items() if is_shared(name))
 
+    def note_outdated(self) -> None:
+        """Services may have gone on there since the last copy."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / OUTDATED).touch()
+
     def _update(self, name: str, size: int, whole: bool) -> bool:
         path = self.folder / name
         has = path.stat().st_size if path.exists() else 0
         grows = name in _TABLES and not whole and has <= size
-        if grows and has == size:
+        if has == size and (grows or (name == BRIDGE_CONFIGURATION and not whole)):
             return True
         content = self._read(name, has if grows else 0)
         if content is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,10 @@ from common.topics import ROBOT_BRIDGE
 from deploy.action_age import ActionAges
 from deploy.actions import ArrivedActions
 from deploy.episodes import Episode, EpisodeTable
-from deploy.mirror import HOSTS_FOLDER, RING_COUNTS, read_ring_counts
+from deploy.mirror import OUTDATED, RING_COUNTS, read_ring_counts
 from deploy.network import NetworkPart
 from deploy.parts import RunParts
+from deploy.record_folders import folder_with, record_folders
 from deploy.run_file import RunFile
 
 RING = "ring"
@@ -46,6 +47,8 @@ class Record:
     ages: ActionAges | None
     ring: RingContent | None
     network: NetworkPart | None
+    is_outdated: bool = False
+    """Of the other computer there are only copies, and its services may have gone on when those had been made."""
     warnings: list[str] = field(default_factory=list)
 
 
@@ -72,24 +75,30 @@ def read_record(*run_dirs: Path) -> Record:
 
     for run_dir in run_dirs:
         attempt(lambda run_dir=run_dir: settle_parts(run_dir))  # type: ignore[misc]
-    mirrors = [path for run_dir in run_dirs for path in sorted(run_dir.glob(f"{HOSTS_FOLDER}/*/"))]
-    folders = [*run_dirs, *mirrors]
+    folders = record_folders(*run_dirs)
     _check_one_run(run_dirs)
-    table = EpisodeTable(_folder_with(folders, "episodes.csv"))
+    table = EpisodeTable(folder_with(folders, "episodes.csv"))
     attempt(table.update)
-    actions = attempt(lambda: ArrivedActions.read(_folder_with(folders, "actions.csv")))
+    actions = attempt(lambda: ArrivedActions.read(folder_with(folders, "actions.csv")))
     unreadable = table.unreadable + (actions.unreadable if actions else 0)
     if unreadable:
         warnings.append(f"{unreadable} rows of episodes.csv and actions.csv could not be read")
-    run = attempt(lambda: RunFile.read(_folder_with(run_dirs, "run.toml")))
+    run = attempt(lambda: RunFile.read(folder_with(run_dirs, "run.toml")))
+    outdated = [folder for folder in folders if len(run_dirs) == 1 and (folder / OUTDATED).exists()]
+    warnings += [
+        f"the record of {folder.name} may not be complete here; when its services have ended, copy its run directory "
+        f"to this computer: python -m deploy.summary {run_dirs[0]} ITS_COPY"
+        for folder in outdated
+    ]
     return Record(
         parts=_parts_of_one_run(RunParts.read(*folders), run, warnings),
         run=run,
         episodes=table.episodes,
         actions=actions,
-        ages=_read_ages(_folder_with(folders, "actions.csv")),
-        ring=attempt(lambda: _read_ring_content(folders)),
-        network=attempt(lambda: _read_network(_folder_with(run_dirs, "network.json"))),
+        ages=_read_ages(folder_with(folders, "actions.csv")),
+        ring=attempt(lambda: _read_ring_content([folder for folder in folders if folder not in outdated])),
+        network=attempt(lambda: _read_network(folder_with(run_dirs, "network.json"))),
+        is_outdated=bool(outdated),
         warnings=warnings,
     )
 
@@ -124,17 +133,12 @@ def _parts_of_one_run(parts: RunParts, run: RunFile | None, warnings: list[str])
         else:
             file = f"parts/{part['service']}-{part['incarnation']}.json"
             warnings.append(f"{file} is of run {name!r}, expected {expected!r}: left out")
-    return RunParts(tuple(own))
-
-
-def _folder_with(folders: Sequence[Path], name: str) -> Path:
-    """The first folder that has the file; the first of all if none does."""
-    return next((folder for folder in folders if (folder / name).exists()), folders[0])
+    return replace(parts, parts=tuple(own))
 
 
 def _read_ring_content(folders: Sequence[Path]) -> RingContent:
-    folder = _folder_with(folders, RING)
-    if not (folder / RING).exists() and (counts := _folder_with(folders, RING_COUNTS) / RING_COUNTS).exists():
+    folder = folder_with(folders, RING)
+    if not (folder / RING).exists() and (counts := folder_with(folders, RING_COUNTS) / RING_COUNTS).exists():
         return RingContent(**read_ring_counts(counts))
     return read_ring(folder / RING)
 

@@ -15,6 +15,7 @@ from common.policies.weights import initial_parameters
 from deploy import evaluate
 from deploy.evaluate import MAX_ATTEMPTS, EvaluatedEpisode, Evaluation, evaluation_text
 from services.robot_bridge.tasks import load_task
+from tests.deploy.test_run_record import RUN
 
 
 class Steering:
@@ -163,6 +164,31 @@ def test_what_is_missing_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[
         run_dir = tmp_path / "nowhere"
     assert evaluate.main([str(run_dir)]) == 1
     assert (missing or "no such run directory") in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("fetched", "service", "host", "own"),
+    [
+        ("config/robot_bridge.toml", "robot_bridge", "local", "learner"),
+        ("policy.msgpack", "learner", "remote", "actor"),
+    ],
+)
+def test_the_other_computer_s_file_is_found_among_those_fetched_and_else_said_to_be_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fetched: str, service: str, host: str, own: str
+) -> None:
+    write_run(tmp_path)
+    RUN.write(tmp_path)
+    (tmp_path / "config" / f"{own}.toml").touch()
+    copy = tmp_path / "hosts" / host / fetched
+    copy.parent.mkdir(parents=True)
+    (tmp_path / fetched).rename(copy)
+    assert evaluate.main([str(tmp_path), "--episodes", "1"]) == 0
+    assert (tmp_path / "evaluation.csv").exists()
+    copy.unlink()
+    capsys.readouterr()
+    assert evaluate.main([str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert f"{tmp_path / fetched} is missing: the {service} ran on the computer {host!r}; copy the file from" in said
 
 
 def test_a_damaged_policy_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

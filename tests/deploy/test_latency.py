@@ -104,6 +104,38 @@ def test_no_run_is_an_error(tmp_path, capsys, make):
     assert "deploy.latency: error: " in capsys.readouterr().err
 
 
+def test_the_strong_computer_s_side_shows_what_was_fetched_from_the_robot_s(tmp_path, capsys):
+    RUN.write(tmp_path)
+    copy = tmp_path / "hosts" / "local"
+    copy.mkdir(parents=True)
+    write_ages(copy, [ROW] * 3)
+    assert latency.main([str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert f"{tmp_path}: remote_only, network outage, dot_reacher" in said
+    assert f"3 applied actions; as far as they were copied to {copy}\n" in said
+    assert (tmp_path / "latency.png").exists()
+
+
+def test_answers_that_are_on_the_other_computer_only_are_said_to_be_there(tmp_path, capsys):
+    RUN.write(tmp_path)
+    (tmp_path / "config").mkdir()
+    (tmp_path / "config" / "learner.toml").touch()
+    assert latency.main([str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert f"{tmp_path / 'actions.csv'} is missing: the robot_bridge ran on the computer 'local'; copy" in said
+    (tmp_path / "config" / "robot_bridge.toml").touch()
+    assert latency.main([str(tmp_path)]) == 1
+    assert "actions.csv is missing: expected the run directory of a run in which actions" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["x.foo", "x", "x.svg"])
+def test_a_picture_s_name_tells_its_format(tmp_path, capsys, name):
+    write_ages(tmp_path, [ROW])
+    assert latency.main([str(tmp_path), "--picture", str(tmp_path / name)]) == 1
+    assert f"--picture {tmp_path / name}: expected a name that ends in .png" in capsys.readouterr().err
+    assert not (tmp_path / name).exists()
+
+
 def test_a_picture_that_cannot_be_written_is_an_error(tmp_path, capsys):
     write_ages(tmp_path, [ROW])
     assert latency.main([str(tmp_path), "--picture", str(tmp_path / "nowhere" / "x.png")]) == 1

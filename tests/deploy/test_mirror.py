@@ -28,10 +28,12 @@ class Copying:
 def test_parts_and_tables_are_copied_and_nothing_else(tmp_path: Path) -> None:
     copying = Copying(tmp_path)
     write_part(copying.there, "actor", 5)
-    for name in ("episodes.csv", "actions.csv", "ring.json", "ring", "policy.msgpack", "parts/actor-5.json.new"):
+    (copying.there / "config").mkdir()
+    shared = {"episodes.csv", "actions.csv", "ring.json", "config/robot_bridge.toml"}
+    for name in (*shared, "ring", "policy.msgpack", "parts/actor-5.json.new", "config/actor.toml"):
         (copying.there / name).write_text(name)
     files = shared_files(copying.there)
-    assert set(files) == {"parts/actor-5.json", "episodes.csv", "actions.csv", "ring.json"}
+    assert set(files) == {"parts/actor-5.json", *shared}
     assert copying.mirror.update(files)
     assert {path.relative_to(copying.here).as_posix() for path in copying.here.rglob("*.*")} == set(files)
     for name in files:
@@ -51,6 +53,15 @@ def test_of_a_table_that_grows_only_what_is_new_is_fetched(tmp_path: Path) -> No
     assert (copying.here / "actions.csv").read_text() == "a,b\n1,2\n3,4\n"
     copying.mirror.update(shared_files(copying.there))
     assert copying.fetched_bytes == 4
+
+
+def test_a_configuration_is_fetched_once(tmp_path: Path) -> None:
+    copying = Copying(tmp_path)
+    (copying.there / "config").mkdir()
+    (copying.there / "config" / "robot_bridge.toml").write_text("[task]\n")
+    for _ in range(3):
+        copying.mirror.update(shared_files(copying.there))
+    assert copying.fetched_bytes == 7
 
 
 def test_at_the_end_a_table_that_was_written_anew_is_fetched_whole(tmp_path: Path) -> None:
