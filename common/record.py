@@ -46,26 +46,33 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def read_parts(directory: Path, service: str = "*") -> list[dict[str, Any]]:
-    """All readable parts of a run's record, oldest incarnation first."""
-    parts = _read_parts(directory, service)
+    """All parts of a run's record but those of :func:`unreadable_parts`, oldest incarnation first."""
+    parts, _ = _read_parts(directory, service)
     return [with_surviving_counts(parts[path]) for path in sorted(parts, key=lambda path: parts[path]["incarnation"])]
+
+
+def unreadable_parts(directory: Path, service: str = "*") -> list[Path]:
+    """Parts that are empty or damaged, as a computer leaves them that loses its power while they are written."""
+    _, unreadable = _read_parts(directory, service)
+    return sorted(unreadable)
 
 
 def settle_parts(directory: Path) -> None:
     """Write what killed services have left in memory into their parts, where a restart of the computer keeps it."""
-    for path, part in _read_parts(directory, "*").items():
+    parts, _ = _read_parts(directory, "*")
+    for path, part in parts.items():
         settle(part, lambda complete, path=path: write_atomically(path, _part_text(complete)))  # type: ignore[misc]
 
 
-def _read_parts(directory: Path, service: str) -> dict[Path, dict[str, Any]]:
-    parts = {}
+def _read_parts(directory: Path, service: str) -> tuple[dict[Path, dict[str, Any]], list[Path]]:
+    parts, unreadable = {}, []
     for path in directory.glob(f"parts/{service}-*.json"):
         try:
             part = json.loads(path.read_text(encoding="utf-8"))
             parts[path] = {**part, "incarnation": int(part["incarnation"])}
-        except (OSError, ValueError, TypeError, KeyError) as error:
-            logger.warning("%s: left out of the record: %r", path, error)
-    return parts
+        except (OSError, ValueError, TypeError, KeyError):
+            unreadable.append(path)
+    return parts, unreadable
 
 
 def _part_text(part: Mapping[str, Any]) -> str:

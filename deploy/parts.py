@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from common.record import read_parts
+from common.record import read_parts, unreadable_parts
 from common.topics import REPLAY, ROBOT_BRIDGE, SERVICES
 
 Part = Mapping[str, Any]
@@ -19,6 +19,8 @@ class RunParts:
     """All parts, oldest incarnation first."""
 
     parts: tuple[Part, ...]
+    unreadable: tuple[tuple[str, int], ...] = ()
+    """Service and incarnation of the parts that are empty or damaged: what depends on their counts is None."""
 
     @classmethod
     def read(cls, *record_dirs: Path) -> RunParts:
@@ -32,7 +34,11 @@ class RunParts:
                 known = newest.get((part["service"], part["incarnation"]))
                 if known is None or float(part.get("wall_s", 0.0)) > float(known.get("wall_s", 0.0)):
                     newest[part["service"], part["incarnation"]] = part
-        return cls(tuple(sorted(newest.values(), key=lambda part: int(part["incarnation"]))))
+        unreadable = {_whose(path) for folder in record_dirs for path in unreadable_parts(folder)} - newest.keys()
+        return cls(
+            tuple(sorted(newest.values(), key=lambda part: int(part["incarnation"]))),
+            tuple(sorted(whose for whose in unreadable if whose[0] in SERVICES)),
+        )
 
     def of(self, service: str) -> list[Part]:
         """The parts of one service."""
@@ -44,17 +50,27 @@ class RunParts:
 
     def latest(self, service: str, counter: str) -> float | None:
         """A counter that goes on over incarnations: the newest one that was reported."""
-        values = self._values(service, counter)
+        values = self._values(service, counter) if self.knows_newest(service) else []
         return values[-1] if values else None
 
     def greatest(self, service: str, counter: str) -> float | None:
         """A counter that never falls over incarnations."""
-        return max(self._values(service, counter), default=None)
+        return max(self._values(service, counter), default=None) if self.knows_newest(service) else None
 
     def total(self, service: str, counter: str) -> float | None:
         """A counter that begins anew with each incarnation."""
-        values = self._values(service, counter)
+        values = self._values(service, counter) if self.knows_all(service) else []
         return sum(values) if values else None
+
+    def knows_newest(self, service: str) -> bool:
+        """False if the part of the service's newest incarnation is unreadable."""
+        unreadable = max((incarnation for name, incarnation in self.unreadable if name == service), default=-1)
+        newest = self.newest(service)
+        return unreadable < (int(newest["incarnation"]) if newest else 0)
+
+    def knows_all(self, service: str) -> bool:
+        """False if the part of any of the service's incarnations is unreadable."""
+        return all(name != service for name, _ in self.unreadable)
 
     def bytes_sent(self) -> dict[str, Counter[str]]:
         """Service -> topic -> payload bytes sent."""
@@ -78,7 +94,7 @@ class RunParts:
 def elapsed_s(parts: RunParts) -> float | None:
     """From the first start of the bridge to its last word, seconds; the time it was away included."""
     bridges = parts.of(ROBOT_BRIDGE)
-    if not bridges:
+    if not bridges or not parts.knows_all(ROBOT_BRIDGE):
         return None
     first, last = bridges[0], bridges[-1]
     between_s = (int(last["incarnation"]) - int(first["incarnation"])) / 1e9
@@ -94,7 +110,8 @@ def produced(parts: RunParts) -> int | None:
     counts: Counter[str] = Counter()
     for part in parts.of(ROBOT_BRIDGE):
         counts[str(part["incarnation"])] = int(part.get("counters", {}).get("produced", 0))
-    if not counts:
+    all_ended = all(part.get("state") == "stopped" for part in parts.of(ROBOT_BRIDGE))
+    if not counts or not parts.knows_all(ROBOT_BRIDGE) or not (all_ended or parts.knows_all(REPLAY)):
         return None
     for part in parts.of(REPLAY):  # each knows only what it has seen itself
         for incarnation, seen in part.get("produced_seen", {}).items():
@@ -104,7 +121,7 @@ def produced(parts: RunParts) -> int | None:
 
 def persisted(parts: RunParts) -> int | None:
     """Distinct TimeSteps that replay has stored."""
-    counts = newest_detail(parts, REPLAY, "persisted")
+    counts = newest_detail(parts, REPLAY, "persisted") if parts.knows_newest(REPLAY) else None
     if counts is None:
         # A run that was stopped before replay had opened its ring: of nothing, nothing was stored.
         return 0 if produced(parts) == 0 else None
@@ -125,8 +142,12 @@ def clock_jumps(parts: RunParts) -> dict[str, int]:
 
 
 def service_failures(parts: RunParts) -> list[dict[str, Any]]:
-    """Incarnations that failed, or never said that they had stopped."""
-    failures = []
+    """Incarnations that failed, or never said that they had stopped, or whose word cannot be read."""
+    unknown = "its part of the record is empty or damaged: its counts are unknown"
+    failures: list[dict[str, Any]] = [
+        {"service": service, "incarnation": incarnation, "failure": unknown}
+        for service, incarnation in parts.unreadable
+    ]
     for part in parts.parts:
         failure = part.get("failure")
         if failure is None and part.get("state") != "stopped":
@@ -134,3 +155,9 @@ def service_failures(parts: RunParts) -> list[dict[str, Any]]:
         if failure is not None:
             failures.append({"service": part["service"], "incarnation": part["incarnation"], "failure": failure})
     return failures
+
+
+def _whose(path: Path) -> tuple[str, int]:
+    """Service and incarnation of the part in a file; of no service if the name does not tell."""
+    service, _, incarnation = path.stem.partition("-")
+    return (service, int(incarnation)) if incarnation.isdecimal() else ("", 0)

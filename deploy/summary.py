@@ -54,7 +54,7 @@ def summarise(record: Record) -> Summary:
     has_goal = run_parts.newest_detail(parts, ROBOT_BRIDGE, "has_goal")
     produced, persisted = run_parts.produced(parts), _persisted(record)
     if persisted is None:
-        warnings.append("replay left no count of what it has persisted")
+        warnings.append("what replay has persisted is not known: it left no last word, and there is no ring here")
     learner = parts.newest(LEARNER)
     if learner is not None and "updates" not in learner.get("counters", {}):
         notes.append("updates is null: the learner was still starting")
@@ -137,10 +137,15 @@ def _steps_per_goal(
 
 def _persisted(record: Record) -> int | None:
     """Distinct TimeSteps that replay has stored: by its own last word, or of one that died before it, by its ring."""
-    replay, counted = record.parts.newest(REPLAY), run_parts.persisted(record.parts)
-    if record.ring is None or replay is None or replay.get("state") == "stopped":
+    parts = record.parts
+    replay, counted = parts.newest(REPLAY), run_parts.persisted(parts)
+    is_last = replay is None or (replay.get("state") == "stopped" and parts.knows_newest(REPLAY))
+    if is_last and (record.ring is not None or not record.is_outdated):
         return counted
-    return max(counted or 0, record.ring.rows - record.ring.duplicated)
+    if record.ring is not None:
+        return max(counted or 0, record.ring.rows - record.ring.duplicated)
+    # It may have stored more after its last word here, which is up to a second old, or as old as this copy of it.
+    return counted if counted == run_parts.produced(parts) else None
 
 
 def _rollouts(parts: RunParts) -> dict[str, int | None] | None:

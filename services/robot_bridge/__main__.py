@@ -16,7 +16,7 @@ import numpy as np
 from common import topics
 from common.errors import ConfigError
 from common.priority import BRIDGE_PRIORITY, run_before_others
-from common.record import read_parts, settle_parts
+from common.record import read_parts, settle_parts, unreadable_parts
 from common.run_service import end_process, run_service
 from common.service import Service
 from common.surviving_counts import SurvivingCounts
@@ -76,6 +76,8 @@ def _give_camera(task: Task, config: RobotBridgeConfig, service: Service) -> Non
 
 def _earlier(directory: Path) -> tuple[Totals, str | None]:
     """What the last incarnation of this run's bridge has left: its counts, and an emergency stop in force."""
+    for path in unreadable_parts(directory, topics.ROBOT_BRIDGE):
+        logger.warning("%s is empty or damaged: what that robot_bridge of this run has counted is unknown", path)
     # A bridge that has not come as far as its task, as this one, has written a part without counts.
     parts = [part for part in read_parts(directory, topics.ROBOT_BRIDGE) if "steps" in part.get("counters", {})]
     if not parts:

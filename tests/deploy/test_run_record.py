@@ -8,7 +8,7 @@ import pytest
 
 from common.errors import ConfigError
 from common.frame_ring import RingWriter
-from deploy.mirror import shared_files, write_ring_counts
+from deploy.mirror import Mirror, read_piece, shared_files, write_ring_counts
 from deploy.run_file import RunFile
 from deploy.run_record import read_record, read_ring
 from deploy.summary import main, summarise
@@ -89,6 +89,37 @@ def test_the_copy_of_the_other_side_s_files_is_as_good_as_its_folder(tmp_path: P
 def test_of_two_copies_of_a_part_the_later_one_counts(tmp_path: Path) -> None:
     local, remote = write_sides(tmp_path)
     write_part(local / "hosts" / "remote", "learner", 130, state="running", wall_s=0.5, counters={"updates": 11})
+    values = summarise(read_record(local, remote)).values
+    assert values["updates"] == 25
+    assert values["service_failures"] == []
+
+
+def test_of_copies_that_are_outdated_it_is_not_known_what_replay_has_stored_since(tmp_path: Path) -> None:
+    local, remote = write_sides(tmp_path)
+    write_ring_counts(remote, 7, 0, 5)
+    mirror = Mirror(local / "hosts" / "remote", lambda name, offset: read_piece(remote, name, offset))
+    assert mirror.update(shared_files(remote))
+    assert summarise(read_record(local)).values["experience"]["lost"] == 2
+    mirror.note_outdated()
+    result = summarise(read_record(local))
+    experience = result.values["experience"]
+    assert (experience["produced"], experience["persisted"], experience["lost"]) == (40, None, None)
+    assert any("the record of remote may not be complete here" in warning for warning in result.warnings)
+    whole = summarise(read_record(local, remote))
+    assert (whole.values["experience"]["lost"], whole.warnings) == (2, [])
+
+
+def test_an_outdated_copy_from_the_robot_s_computer_leaves_what_is_known_of_replay(tmp_path: Path) -> None:
+    _, remote = write_sides(tmp_path)
+    Mirror(remote / "hosts" / "local", lambda name, offset: None).note_outdated()
+    assert summarise(read_record(remote)).values["experience"]["persisted"] == 38
+
+
+def test_an_unreadable_copy_of_a_part_costs_nothing_where_the_part_itself_is_there(tmp_path: Path) -> None:
+    local, remote = write_sides(tmp_path)
+    copy = write_part(local / "hosts" / "remote", "learner", 130)
+    copy.write_text("", encoding="utf-8")
+    assert summarise(read_record(local)).values["updates"] is None
     values = summarise(read_record(local, remote)).values
     assert values["updates"] == 25
     assert values["service_failures"] == []

@@ -254,6 +254,56 @@ def test_a_damaged_piece_costs_only_what_is_in_it(tmp_path: Path, name: str) -> 
     summary_text(result.values)
 
 
+@pytest.mark.parametrize("content", ["", "{ damaged"])
+def test_of_a_service_whose_part_is_empty_or_damaged_the_counts_are_unknown_and_that_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str
+) -> None:
+    write_run(tmp_path)
+    (tmp_path / "parts" / "learner-150.json").write_text(content, encoding="utf-8")
+    assert summary.main([str(tmp_path)]) == 0
+    values = json.loads((tmp_path / "summary.json").read_text())
+    # That of the learner which was killed before it says 500 updates and 10 policies: less than there were.
+    assert (values["updates"], values["policy_pushes"], values["policy_version"]) == (None, None, None)
+    failure = "its part of the record is empty or damaged: its counts are unknown"
+    assert {"service": "learner", "incarnation": 150, "failure": failure} in values["service_failures"]
+    said = capsys.readouterr()
+    assert said.out.count(f"learner: {failure}") == 1
+    assert "Error" not in said.out + said.err
+
+
+@pytest.mark.parametrize(
+    ("name", "persisted"),
+    [
+        ("robot_bridge-100", 302),  # the first of two
+        ("robot_bridge-50000000100", 302),
+        ("replay-120", 302),  # the newer replay goes on from its count
+        ("replay-130", None),
+    ],
+)
+def test_what_depends_on_an_unreadable_part_is_unknown_and_nothing_else(
+    tmp_path: Path, name: str, persisted: int | None
+) -> None:
+    write_run(tmp_path)
+    (tmp_path / "parts" / f"{name}.json").write_text("", encoding="utf-8")
+    values = summarise(read_record(tmp_path)).values
+    experience = values["experience"]
+    # Of the bridge that was killed, a replay may know more than the bridge's last part.
+    assert (experience["produced"], experience["persisted"], experience["lost"]) == (None, persisted, None)
+    assert values["updates"] == 2400
+    # Steps go on over incarnations of the bridge, cycles begin anew.
+    assert values["steps"] == (None if name == "robot_bridge-50000000100" else 3000)
+    assert values["cycles"] == (None if name.startswith("robot_bridge") else 3000)
+
+
+def test_without_ring_and_last_word_of_replay_nothing_is_said_to_be_lost(tmp_path: Path) -> None:
+    write_part(tmp_path, "robot_bridge", 7, counters={"produced": 1299}, **BRIDGE)
+    write_part(tmp_path, "replay", 8, state="running", persisted={"7": 233})
+    result = summarise(read_record(tmp_path))
+    experience = result.values["experience"]
+    assert (experience["produced"], experience["persisted"], experience["lost"]) == (1299, None, None)
+    assert any("what replay has persisted is not known" in warning for warning in result.warnings)
+
+
 def test_a_run_without_run_toml_still_has_what_its_bridge_says(tmp_path: Path) -> None:
     write_part(tmp_path, "robot_bridge", 100, counters={"steps": 10}, **BRIDGE)
     values = summarise(read_record(tmp_path)).values
