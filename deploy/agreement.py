@@ -34,7 +34,7 @@ def facts_of(
         "message schema": str(SCHEMA_VERSION),
         "--base-port": str(base_port),
         **{f"endpoint {host}": addresses[host] for host in HOSTS},
-        **{f"host of {service}": host for service, host in placement.host.items()},
+        **{host_fact(service): host for service, host in placement.host.items()},
     }
     if run_id is not None:
         facts[RUN_ID] = run_id
@@ -45,6 +45,11 @@ def facts_of(
                 if name not in _NOT_ALIKE and not name.startswith(_TOLD_SEPARATELY):
                     facts[f"{service}: {name}"] = repr(value)
     return facts
+
+
+def host_fact(service: str) -> str:
+    """Name of the fact on which host a service runs."""
+    return f"host of {service}"
 
 
 def differences(here: Facts, there: Facts, here_name: Host, there_name: Host) -> list[str]:

@@ -91,11 +91,18 @@ class Listener:
         silent = self._other.silent_s > SILENT_S
         if silent != self._silent and news.phase != ENDED:
             self._silent = silent
-            self._console.error(
-                f"the launcher on {there} has not answered for {SILENT_S:.0f} s; the services here go on"
-                if silent
-                else f"the launcher on {there} answers again"
-            )
+            self._console.error("\n".join(self._silence(news)) if silent else f"the launcher on {there} answers again")
+
+    def _silence(self, news: News) -> list[str]:
+        there = self._other.there
+        lines = [f"the launcher on {there} has not answered for {SILENT_S:.0f} s; the services here go on"]
+        if self._robot_is_here and news.restart and not self._over:
+            lines += [
+                f"  if only the network is down, the services on {there} go on, too, until it is back",
+                "  if that launcher was killed, they ended with it; end here with Ctrl-C, or start them again there:",
+            ]
+            lines += [f"  {command}" for command in news.restart]
+        return lines
 
     def _ending(self, news: News) -> list[str]:
         lines = [f"{self._other.there} has ended: {news.outcome}"]

@@ -3,7 +3,8 @@
 Each side asks the other for its news, over a Zenoh session of the launchers' own; the computer ``remote`` connects to
 ``local``. A question and an answer both carry the news of who sends them::
 
-    {"ask": "news" | "file", "name": ..., "offset": ..., "news": {...}}   ->   {"news": {...}}, or a file's bytes
+    {"ask": "news", "news": {...}}                                   ->   {"news": {...}}
+    {"ask": "file", "name": ..., "offset": ..., "news": {...}}       ->   the launcher's name, then the file's bytes
 """
 
 from __future__ import annotations
@@ -149,7 +150,8 @@ class OtherSide:
             question = json.loads(payload)
             self._hear(news_from(question["news"]))
             if question["ask"] == "file":
-                return read_piece(self._run_dir, str(question["name"]), int(question["offset"]))
+                piece = read_piece(self._run_dir, str(question["name"]), int(question["offset"]))
+                return self._mine.launcher.encode() + piece
         except (ValueError, KeyError, TypeError, MessageError):
             pass  # whoever asks that is no launcher of this release; who we are it may know
         return json.dumps({"news": self._told()}).encode()
@@ -173,8 +175,8 @@ class OtherSide:
         if news is None:
             return
         with self._lock:
-            complete = self._mine.has_record
-        if not (complete or self._stopping.is_set()):
+            complete, is_ours = self._mine.has_record, self._mine.agreed_with == news.launcher
+        if is_ours and not (complete or self._stopping.is_set()):
             ended = news.phase == ENDED
             if self.mirror.update(news.files, whole=ended) and ended:
                 self.tell(has_record=True)
@@ -184,7 +186,12 @@ class OtherSide:
         return self._transport.query(launcher_topic(self.there), json.dumps(question).encode(), _ANSWER_WITHIN_S)
 
     def _fetch(self, name: str, offset: int) -> bytes | None:
-        return self._query("file", name=name, offset=offset)
+        news, answer = self.news, self._query("file", name=name, offset=offset)
+        if news is None or answer is None:
+            return None
+        # After that launcher was killed another one may answer, whose run directory has no files of this run.
+        owner = news.launcher.encode()
+        return answer[len(owner) :] if answer.startswith(owner) else None
 
     def _hear(self, news: News) -> None:
         with self._lock:

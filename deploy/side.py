@@ -11,7 +11,7 @@ from common.errors import ConfigError
 from common.run_settings import RunSettings, TransportSettings
 from common.topics import ROBOT_BRIDGE, Lane
 from common.transport import ZenohTransport
-from deploy.agreement import RELEASE, RUN_ID, differences, facts_of
+from deploy.agreement import RELEASE, RUN_ID, differences, facts_of, host_fact
 from deploy.computers import TwoComputers, other_host
 from deploy.console import Console
 from deploy.listener import INTERRUPTED_S, SILENT_S, Listener
@@ -145,10 +145,7 @@ def _check_same_run(
     other: OtherSide, facts: dict[str, str], news: News, here: Host, there: Host, console: Console
 ) -> None:
     if other.is_taken(news):
-        raise ConfigError(
-            f"the launcher of {there!r} is in a run with another launcher of {here!r}; end that run first, or start "
-            "the services again by hand, as it says there"
-        )
+        raise ConfigError(_refusal(here, there, robot_is_here=facts[host_fact(ROBOT_BRIDGE)] == here))
     unequal = differences(facts, news.facts, here, there)
     if unequal:
         time.sleep(_TOLD_S)  # The other side shall hear of it, too.
@@ -161,6 +158,20 @@ def _check_same_run(
             f"deploy.launch: warning: release {facts[RELEASE]} here, {news.facts.get(RELEASE)} on {there}; settings "
             "and messages are the same"
         )
+
+
+def _refusal(here: Host, there: Host, *, robot_is_here: bool) -> str:
+    """What a launcher is told that comes back to a run whose first launcher here was killed."""
+    refusal = (
+        f"the launcher of {there!r} is in a run with another launcher of {here!r}, which only that one can take part "
+        f"in; end the run on {there}, with Ctrl-C if need be, and start both sides anew"
+    )
+    if not robot_is_here:
+        refusal += (
+            f". Or let that run go on: the launcher on {there} shows the commands that start the services of {here} "
+            f"again, once it has heard nothing of the other one for {SILENT_S:.0f} s"
+        )
+    return refusal
 
 
 def _leave_ring_counts(run_dir: Path) -> None:
@@ -193,10 +204,7 @@ def _exchange_records(
         console.status(f"waiting for {other.there} to end, for its part of the record")
         time.sleep(_POLL_S)
     if listener.was_left_alone or not other.has_record:
-        console.error(
-            f"deploy.launch: warning: the record of {other.there} may not be complete here; when its services have "
-            "ended, copy its run directory to this computer: python -m deploy.summary RUN_DIR ITS_COPY"
-        )
+        other.mirror.note_outdated()
 
 
 def _launcher_ports(host: Host, base_port: int) -> dict[Lane, int]:

@@ -66,6 +66,28 @@ def test_silence_and_its_end_are_told_once() -> None:
     ]
 
 
+def test_when_the_launcher_there_falls_silent_the_robot_s_side_says_how_to_go_on() -> None:
+    scene = Scene(robot_is_here=True, silent_s=SILENT_S + 0.1)
+    scene.hear(restart=["cd /there", "python -m services.replay"])
+    assert not scene.ends()
+    said = scene.out.getvalue()
+    assert said.startswith("the launcher on remote has not answered for 10 s; the services here go on\n")
+    assert said.endswith("start them again there:\n  cd /there\n  python -m services.replay\n")
+    scene.now_s += 1000.0
+    assert not scene.ends()
+    assert scene.out.getvalue() == said
+
+
+@pytest.mark.parametrize(("robot_is_here", "over"), [(False, False), (True, True)])
+def test_silence_tells_no_commands_where_they_would_bring_nothing(robot_is_here: bool, over: bool) -> None:
+    scene = Scene(robot_is_here=robot_is_here, silent_s=SILENT_S + 0.1)
+    scene.hear(restart=["cd /there"])
+    if over:
+        scene.listener.note_end()
+    scene.listener.listen()
+    assert scene.out.getvalue() == "the launcher on remote has not answered for 10 s; the services here go on\n"
+
+
 def test_ctrl_c_there_leaves_the_robot_s_side_running_and_says_how_to_go_on() -> None:
     scene = Scene(robot_is_here=True)
     scene.hear(phase=ENDED, outcome="stopped by Ctrl-C", restart=["cd /there", "python -m services.replay"])

@@ -65,6 +65,9 @@ def test_each_side_hears_what_the_other_tells(scene: Scene) -> None:
 
 def test_the_record_comes_over_while_it_grows_and_is_whole_at_the_end(scene: Scene) -> None:
     local, remote = scene.launcher("local", "remote"), scene.launcher("remote", "local")
+    eventually(lambda: local.news is not None and remote.news is not None)
+    for side in (local, remote):
+        side.agree()
     write_part(scene.folder / "local", "robot_bridge", 5, state="running")
     write_actions(scene.folder / "local", [(1.0, 1.1)])
     local.share_files()
@@ -91,18 +94,22 @@ def test_before_a_run_is_agreed_on_no_files_are_told(scene: Scene) -> None:
     assert remote.news.files == {}
 
 
-def test_a_third_launcher_is_told_that_it_comes_too_late_and_changes_nothing(scene: Scene) -> None:
+def test_a_third_launcher_is_told_that_it_comes_too_late_and_gets_and_changes_nothing(scene: Scene) -> None:
     local, remote = scene.launcher("local", "remote"), scene.launcher("remote", "local")
     eventually(lambda: local.news is not None and remote.news is not None)
     for side in (local, remote):
         side.agree(phase=RUNNING)
     eventually(lambda: phase_of(local) == phase_of(remote) == RUNNING)
+    write_part(scene.folder / "local", "actor", 5)
+    local.share_files()
     late = scene.launcher("remote", "local", name="late")
     late.tell(phase=ENDED)
     eventually(lambda: late.news is not None and late.is_taken(late.news))
     assert phase_of(local) == RUNNING
     assert local.news is not None
     assert not local.is_taken(local.news)
+    late.close()
+    assert list((scene.folder / "late").iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -116,6 +123,26 @@ def test_a_question_that_is_none_changes_nothing_and_gets_an_answer(scene: Scene
     assert local.news is None
 
 
+def test_what_another_launcher_has_does_not_replace_the_copy_of_a_killed_one_s_record(scene: Scene) -> None:
+    local, remote = scene.launcher("local", "remote"), scene.launcher("remote", "local")
+    eventually(lambda: local.news is not None and remote.news is not None)
+    for side in (local, remote):
+        side.agree(phase=RUNNING)
+    part = write_part(scene.folder / "remote", "learner", 5, state="running")
+    write_actions(scene.folder / "remote", [(1.0, 1.1)])
+    remote.share_files()
+    copy = scene.folder / "local" / "hosts" / "remote"
+    eventually((copy / "actions.csv").exists)
+    assert local.news is not None
+    files = local.news.files
+    remote.close()
+    late = scene.launcher("remote", "local", name="late")
+    eventually(lambda: late.news is not None)
+    assert not local.mirror.update(files, whole=True)
+    assert (copy / "parts" / "learner-5.json").read_bytes() == part.read_bytes()
+    assert (copy / "actions.csv").read_bytes() == (scene.folder / "remote" / "actions.csv").read_bytes()
+
+
 def test_a_file_is_given_in_pieces_and_only_from_the_record(scene: Scene) -> None:
     scene.launcher("local", "remote")
     write_actions(scene.folder / "local", [(1.0, 1.1)])
@@ -127,10 +154,12 @@ def test_a_file_is_given_in_pieces_and_only_from_the_record(scene: Scene) -> Non
         return scene.stranger.query(launcher_topic("local"), json.dumps(question).encode())
 
     content = (scene.folder / "local" / "actions.csv").read_bytes()
-    assert ask("actions.csv", 0) == content
-    assert ask("actions.csv", 10) == content[10:]
-    assert ask("ring", 0) == b""
-    assert ask("../remote/actions.csv", 0) == b""
+    whose = ask("", 0)
+    assert whose
+    assert ask("actions.csv", 0) == whose + content
+    assert ask("actions.csv", 10) == whose + content[10:]
+    assert ask("ring", 0) == whose
+    assert ask("../remote/actions.csv", 0) == whose
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,12 @@ from pathlib import Path
 import pytest
 
 from deploy import launch
+from deploy.computers import other_host
+from deploy.network import HOSTS, Host
 from deploy.ports import held_ports, reserved_ports
 from deploy.side import SIDE_PORTS
 from tests.deploy.test_launch import REPOSITORY, finish, is_running, wait_for_parts
+from tests.helpers import eventually
 
 ADDRESSES = {"local": "127.0.0.2", "remote": "127.0.0.3"}
 MODE = """
@@ -129,6 +132,28 @@ def test_ctrl_c_on_the_strong_computer_ends_its_services_and_is_told_on_the_othe
     assert computers.summary("local")["steps"] == 100
 
 
+@pytest.mark.parametrize("killed", ["local", "remote"])
+def test_a_killed_launcher_s_services_end_and_its_successor_is_told_what_can_be_done(
+    computers: Computers, killed: Host
+) -> None:
+    there = other_host(killed)
+    launchers = {host: computers.start(host) for host in HOSTS}
+    pids = wait_for_parts(computers.run_dir(killed), 2)
+    wait_for_parts(computers.run_dir(there) / "hosts" / killed, 2)  # until then, the other side may not have agreed
+    launchers[killed].kill()
+    launchers[killed].communicate()
+    eventually(lambda: not any(map(is_running, pids)))
+    (computers.folder / "first").mkdir()
+    computers.run_dir(killed).rename(computers.folder / "first" / killed)
+    code, _, errors = finish(computers.start(killed))
+    assert code == 1
+    assert f"the launcher of '{there}' is in a run with another launcher of '{killed}'" in errors
+    assert f"end the run on {there}, with Ctrl-C if need be, and start both sides anew" in errors
+    # Only the robot's side goes on without the other, and shows how that can return.
+    assert ("shows the commands that start the services of remote again" in errors) == (killed == "remote")
+    assert not computers.run_dir(killed).exists()
+
+
 def test_ctrl_c_on_the_robot_s_computer_ends_both(computers: Computers) -> None:
     local, remote = computers.start("local"), computers.start("remote")
     pids = [pid for host in ("local", "remote") for pid in wait_for_parts(computers.run_dir(host), 2)]
@@ -193,6 +218,11 @@ def test_a_launcher_that_nobody_answers_gives_up_and_says_what_to_look_at(
         (["--endpoint", "local=192.0.2.8", "--endpoint", "remote=192.0.2.7"], "not an address of this computer"),
         (["--endpoint", "lokal=10.0.0.1"], "unknown host 'lokal'"),
         (["--endpoint", "127.0.0.1"], "expected HOST=ADDRESS"),
+        (
+            ["--endpoint", "local=127.0.0.4", "--endpoint", "local=127.0.0.2"],
+            "--endpoint local=127.0.0.2: expected once for each host, got local=127.0.0.4 too",
+        ),
+        (["--endpoint", "remote=127.0.0.2"], "endpoints local = remote = 127.0.0.2: expected the addresses of two"),
         (["--network", "wifi_bad"], "with --host nothing is emulated"),
         (["--set", "network.loss=0.1"], "with --host nothing is emulated"),
         (["--base-port", "65530"], "--base-port 65530: expected a port from 1 to 65524"),
