@@ -54,6 +54,14 @@ def test_a_bridge_that_never_came_to_count_does_not_set_the_run_back(tmp_path):
     assert serve_in(tmp_path, robot_bridge={"steps": 40}).counters()["steps"] == 40
 
 
+def test_a_bridge_after_one_whose_part_is_empty_goes_on_from_the_one_before_and_says_so(tmp_path, caplog):
+    write_part(tmp_path, 10, {"steps": 40, "acted_steps": 40, "episodes": 1, "attempts": 3})
+    empty = tmp_path / "parts" / "robot_bridge-11.json"
+    empty.touch()
+    assert serve_in(tmp_path, robot_bridge={"steps": 40}).counters()["steps"] == 40
+    assert f"{empty} is empty or damaged: what that robot_bridge of this run has counted is unknown" in caplog.text
+
+
 def test_the_task_is_built_as_configured(tmp_path):
     write_part(tmp_path, 10, {"steps": 1})
     service = serve_in(
