@@ -16,6 +16,7 @@ import tomli_w
 
 from common.errors import ConfigError
 from common.record import write_atomically
+from deploy.network import recorded_table
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -53,17 +54,20 @@ class RunFile:
     placement: dict[str, str]
     """Service -> host."""
     conditions: dict[str, Any] = field(default_factory=dict)
-    """The network's ``[network]`` table; empty if nothing crosses one."""
+    """The network's ``[network]`` table; empty if nothing crosses one. On disk, rows of traces are files beside it."""
     versions: dict[str, str] = field(default_factory=dict)
     host_budget: str = ""
     """Name of the computer that the learner's stands for; empty: itself."""
+    ended_early: str = ""
+    """Why the run was told to end before it had made its steps; empty: it was not."""
+    started: datetime = field(default_factory=lambda: datetime.now().astimezone().replace(microsecond=0))
 
     def write(self, run_dir: Path) -> None:
-        """Write ``run_dir/run.toml``."""
+        """Write ``run_dir/run.toml``, and its network's traces beside it."""
         facts = asdict(self)
         tables = {name: facts.pop(name) for name in ("placement", "conditions", "versions")}
-        started = datetime.now().astimezone().replace(microsecond=0)
-        document = {"run": {**facts, "started": started}, **_without_none(tables)}
+        tables["conditions"] = recorded_table(tables["conditions"], run_dir)
+        document = {"run": facts, **_without_none(tables)}
         write_atomically(run_dir / "run.toml", tomli_w.dumps(document))
 
     @classmethod
@@ -76,9 +80,8 @@ class RunFile:
         path = run_dir / "run.toml"
         try:
             document = tomllib.loads(path.read_text(encoding="utf-8"))
-            facts = {key: value for key, value in document["run"].items() if key != "started"}
             tables = {name: document.get(name, {}) for name in ("placement", "conditions", "versions")}
-            return cls(**facts, **tables)
+            return cls(**document["run"], **tables)
         except FileNotFoundError:
             raise ConfigError(f"{path} is missing") from None
         except OSError as error:

@@ -47,6 +47,9 @@ class VirtualLink:
     def __init__(self, clock: SimulatedClock, conditions: NetworkConditions, seed: int) -> None:
         self._clock, self._conditions = clock, conditions
         self._start_ns = clock.now_ns()
+        limited = any(conditions.direction(name).bytes_per_s for name in DIRECTIONS)
+        self.buffer_bytes = LIMITED_BUFFER_BYTES if limited else BUFFER_BYTES
+        """What the sender's end of a connection can hold."""
         self.directions: dict[Direction, VirtualDirection] = {
             name: VirtualDirection(clock, PacketSchedule(conditions, name, direction_random(seed, name)))
             for name in DIRECTIONS
@@ -57,11 +60,6 @@ class VirtualLink:
         there = self.directions[direction_from(sender)]
         back = self.directions[direction_from("remote" if sender == "local" else "local")]
         return TcpStream(self._clock, there, back)
-
-    def buffer_bytes(self) -> int:
-        """What the sender's end of a connection can hold."""
-        limited = any(self._conditions.direction(name).bytes_per_s for name in DIRECTIONS)
-        return LIMITED_BUFFER_BYTES if limited else BUFFER_BYTES
 
     def over(self) -> str | None:
         """Why the link is over: a trace that stops. None if it is not."""
@@ -160,7 +158,7 @@ class VirtualNetwork(InMemoryNetwork):
     def _cross(self, topic: Topic, payload: bytes, source: str, sink: str, subscription: Subscription) -> None:
         stream = self._stream(source, sink, topic.lane)
         size_bytes = len(payload) + MESSAGE_OVERHEAD_BYTES
-        buffer_bytes = self._link.buffer_bytes()
+        buffer_bytes = self._link.buffer_bytes
         if not topic.waits and stream.backlog_bytes + size_bytes > buffer_bytes:
             self.dropped[topic.name] += 1
             return

@@ -17,7 +17,7 @@ from deploy.network.part import NetworkPart
 from deploy.network.presets import PRESETS
 from deploy.network.relay_link import RelayLink
 from deploy.network.schedule import DropCause, OutageTimes, PacketSchedule, StreamSchedule, direction_random
-from deploy.network.table import load_network, parse_network
+from deploy.network.table import load_network, parse_network, recorded_table
 from deploy.network.trace import Trace, read_trace
 
 __all__ = [
@@ -49,4 +49,5 @@ __all__ = [
     "open_link",
     "parse_network",
     "read_trace",
+    "recorded_table",
 ]

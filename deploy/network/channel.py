@@ -44,6 +44,7 @@ class Channel:
         self.limited = one_way.bytes_per_s is not None
         """Whether there is a rate at all."""
         self._moments = _moments(one_way, self._leave_burst)
+        self._silent = one_way.silent
 
     def bytes_per_s(self, time_s: float) -> float:
         """The rate, bytes/s; infinite: unlimited."""
@@ -72,8 +73,10 @@ class Channel:
 
     def passable_s(self, time_s: float) -> float:
         """The first time from ``time_s`` on at which not everything is lost; never: infinity."""
-        if self._trace is None or all(moment.loss == 1 for moment in self._moments):
-            return math.inf if self._moments[0].loss == 1 else time_s
+        if self._silent:
+            return math.inf
+        if self._trace is None:
+            return time_s
         while not math.isinf(time_s) and self._at(time_s).loss == 1:
             # However the sum is rounded, time goes on.
             time_s = max(self._trace.row_ends_s(time_s), math.nextafter(time_s, math.inf))

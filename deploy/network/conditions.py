@@ -58,7 +58,7 @@ class DirectionConditions:
     loss_between_bursts: float = 0.0
     """Fraction of packets lost outside of bursts."""
     trace: Trace | None = None
-    """Delay, loss and rate over time; what it says replaces ``delay_ms``, ``loss`` and ``rate_mbit``."""
+    """Delay, loss and rate over time; what it says, ``delay_ms``, ``loss`` and ``rate_mbit`` must not say too."""
 
     def __post_init__(self) -> None:
         values = {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
@@ -80,12 +80,20 @@ class DirectionConditions:
             return self.trace.mean(self.trace.rate_mbit) * 1e6 / 8
         return bytes_per_s(self.rate_mbit)
 
+    @property
+    def silent(self) -> bool:
+        """Whether everything is lost, always."""
+        losses = self.trace.loss if self.trace and self.trace.loss is not None else (self.loss,)
+        return min(losses) == 1
+
     def to_table(self) -> dict[str, Any]:
         """The keys and values of this direction's table; a trace with its rows."""
         values = {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
         if self.trace is None:
             del values["trace"]
             return values
+        for column in self.trace.columns:
+            del values[column]
         return {**values, "trace": self.trace.to_table(), "trace_end": self.trace.end}
 
 
@@ -128,6 +136,10 @@ class NetworkConditions:
         return {**directions, **link, **chosen}
 
 
+DIRECTION_DEFAULTS = {item.name: item.default for item in dataclasses.fields(DirectionConditions)}
+"""Key of a direction -> its value where nothing is said."""
+
+
 def bytes_per_s(rate_mbit: float | None) -> float | None:
     """A rate in bytes/s; None: unlimited."""
     return None if rate_mbit is None or math.isinf(rate_mbit) else rate_mbit * 1e6 / 8
@@ -164,6 +176,9 @@ def check_key(key: str, value: object, where: str) -> None:
 def check_together(values: Mapping[str, Any], where: str) -> None:
     """Refuse values of one direction that contradict each other. Each has passed :func:`check_key`."""
     trace: Trace | None = values["trace"]
+    for column in trace.columns if trace else ():
+        if values[column] != DIRECTION_DEFAULTS[column]:
+            raise said_twice(column, values[column], where, f"the trace {trace.name}")  # type: ignore[union-attr]
     _check_jitter(values, trace, where)
     if values["queue_packets"] and values["rate_mbit"] in (None, math.inf) and not (trace and trace.rate_mbit):
         raise ConfigError(
@@ -182,6 +197,13 @@ def check_together(values: Mapping[str, Any], where: str) -> None:
         )
     for loss in losses:
         _check_bursts(loss, values, where)
+
+
+def said_twice(column: str, value: object, where: str, whose: str) -> ConfigError:
+    """The error that a number is given which a trace's column would override."""
+    return ConfigError(
+        f"{where}.{column} = {value!r}: {whose} has a column {column}, and only one of the two can hold; leave one out"
+    )
 
 
 def _check_jitter(values: Mapping[str, Any], trace: Trace | None, where: str) -> None:

@@ -1,11 +1,13 @@
 """run.toml: written, read back, and refused when it cannot be used."""
 
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
 from common.errors import ConfigError
-from deploy.network import PRESETS, parse_network
+from deploy.network import PRESETS, DirectionConditions, NetworkConditions, Trace, parse_network
 from deploy.run_file import RunFile, versions
 
 RUN = RunFile(
@@ -33,6 +35,23 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
 def test_an_unlimited_rate_survives(tmp_path: Path) -> None:
     RunFile(**{**vars(RUN), "conditions": PRESETS["ideal"].to_table()}).write(tmp_path)
     assert parse_network(RunFile.read(tmp_path).conditions) == PRESETS["ideal"]
+
+
+def test_the_rows_of_a_trace_are_kept_beside_it(tmp_path: Path) -> None:
+    trace = Trace("office.csv", (0, 0.1, 1 / 3), delay_ms=(4.2, 3.9, 2 / 7), end="stop")
+    conditions = NetworkConditions(DirectionConditions(trace=trace), PRESETS["wifi_bad"].downlink)
+    RunFile(**{**vars(RUN), "conditions": conditions.to_table()}).write(tmp_path)
+    assert "0.1" not in (tmp_path / "run.toml").read_text(encoding="utf-8")
+    assert parse_network(RunFile.read(tmp_path).conditions, directory=tmp_path) == conditions
+
+
+def test_a_file_that_is_written_again_keeps_when_the_run_started(tmp_path: Path) -> None:
+    started = datetime(2026, 5, 4, 3, 2, 1, tzinfo=UTC)
+    RunFile(**{**vars(RUN), "started": started}).write(tmp_path)
+    read = RunFile.read(tmp_path)
+    replace(read, ended_early="interrupted").write(tmp_path)
+    assert RunFile.read(tmp_path) == replace(read, ended_early="interrupted")
+    assert read.started == started
 
 
 @pytest.mark.parametrize("text", ["[run", "", "[run]\nid = 'x'", "[run]\nunknown = 1"])

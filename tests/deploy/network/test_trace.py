@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 import random
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,7 +18,9 @@ from deploy.network import (
     load_network,
     parse_network,
     read_trace,
+    recorded_table,
 )
+from deploy.network.trace import MAX_ROWS
 
 _CSV = "time_s,delay_ms,loss,rate_mbit\n0,4,0,8\n0.5,6,1,8\n\n1.5,2,0,4\n"
 
@@ -111,6 +114,108 @@ def test_a_table_names_a_trace_next_to_its_file_and_each_direction_may_have_its_
     conditions = load_network(path)
     assert conditions.uplink.trace == read_trace(tmp_path / "link.csv", end="stop")
     assert conditions.downlink.trace == read_trace(tmp_path / "link.csv", end="loop")
+
+
+def test_a_file_that_both_directions_name_is_read_once(tmp_path: Path) -> None:
+    _write(tmp_path, _CSV)
+    conditions = parse_network({"trace": "link.csv", "downlink": {"queue_ms": 3}}, directory=tmp_path)
+    assert conditions.uplink.trace is conditions.downlink.trace
+
+
+def test_the_byte_order_mark_of_a_spreadsheet_is_no_part_of_the_first_column(tmp_path: Path) -> None:
+    path = _write(tmp_path, "\ufefftime_s,delay_ms\n0,4\n2,5\n")
+    assert path.read_bytes().startswith(b"\xef\xbb\xbftime_s")
+    assert read_trace(path) == Trace(str(path), (0, 2), delay_ms=(4, 5))
+
+
+def test_a_trace_of_a_day_second_by_second_is_taken_and_of_more_rows_than_the_limit_refused(tmp_path: Path) -> None:
+    head = "time_s,loss\n"
+    day = _write(tmp_path, head + "".join(f"{second},0\n" for second in range(86_400)))
+    assert read_trace(day).length_s == 86_400
+    most = _write(tmp_path, head + "".join(f"{second},0\n" for second in range(MAX_ROWS)))
+    assert len(read_trace(most).time_s) == MAX_ROWS
+    with most.open("a", encoding="utf-8") as file:
+        file.write(f"{MAX_ROWS},0\n")
+    with pytest.raises(ConfigError, match=r"link\.csv: more than 100000 rows: expected at most that many"):
+        read_trace(most)
+    seconds = tuple(map(float, range(MAX_ROWS + 1)))
+    with pytest.raises(ConfigError, match=r"^t: more than 100000 rows"):
+        Trace("t", seconds, loss=seconds)
+
+
+def test_of_a_file_with_too_many_rows_the_rest_is_not_read(tmp_path: Path) -> None:
+    rows = "".join(f"{second},0\n" for second in range(MAX_ROWS + 1))
+    path = tmp_path / "link.csv"
+    # Farther than any buffer from the rows: what cannot be read there would be told instead.
+    path.write_bytes(f"time_s,loss\n{rows}".encode() + b"1,1\n" * 1_000_000 + b"\xff\n")
+    with pytest.raises(ConfigError, match="more than 100000 rows"):
+        read_trace(path)
+
+
+def test_a_record_has_the_rows_in_files_from_which_equal_conditions_are_read(tmp_path: Path) -> None:
+    trace = Trace("/far/away.csv", (0, 0.1, 1 / 3), delay_ms=(4.2, 1e-9, 7), rate_mbit=(38, 2 / 7, 1), end="stop")
+    conditions = NetworkConditions(
+        DirectionConditions(loss=0.25, trace=trace), DirectionConditions(trace=Trace("t", (0, 1), loss=(0, 1)))
+    )
+    table = recorded_table(conditions.to_table(), tmp_path)
+    assert table["uplink"]["trace"] == {"name": "/far/away.csv", "file": "uplink_trace.csv"}
+    assert (tmp_path / "downlink_trace.csv").read_text() == "time_s,loss\n0,0\n1,1\n"
+    assert parse_network(table, directory=tmp_path) == conditions
+
+
+@pytest.mark.parametrize(
+    ("table", "reason"),
+    [
+        ({"file": "link.csv", "end": "stop"}, r"network\.trace\.end = 'stop': expected only name and file"),
+        ({"file": 3}, r"network\.trace\.file = 3: expected only name and file, which are texts"),
+        ({"name": "t", "file": "none.csv"}, r"none\.csv: a trace that cannot be read"),
+    ],
+)
+def test_a_record_whose_trace_cannot_be_read_is_refused(tmp_path: Path, table: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        parse_network({"trace": table}, directory=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("table", "reason"),
+    [
+        (
+            {"trace": "link.csv", "delay_ms": 7.0},
+            r"^network\.delay_ms = 7\.0: the trace \S*link\.csv has a column delay_ms, .*leave one out",
+        ),
+        # Also where the number is what holds anyway if nothing is said.
+        ({"trace": "link.csv", "loss": 0.0}, r"^network\.loss = 0\.0: the trace \S*link\.csv has a column loss"),
+        ({"trace": "link.csv", "uplink": {"rate_mbit": 3}}, r"^network\.uplink\.rate_mbit = 3: the trace \S*link\.csv"),
+        ({"downlink": {"trace": "link.csv", "loss": 0.5}}, r"^network\.downlink\.loss = 0\.5: the trace"),
+        (
+            {"delay_ms": 7, "uplink": {"trace": "link.csv"}, "downlink": {"trace": "link.csv"}},
+            r"^network\.delay_ms = 7: the trace of each direction has a column delay_ms",
+        ),
+    ],
+)
+def test_a_number_that_a_column_of_the_trace_would_override_is_refused(
+    tmp_path: Path, table: dict[str, Any], reason: str
+) -> None:
+    _write(tmp_path, _CSV)
+    with pytest.raises(ConfigError, match=reason):
+        parse_network(table, directory=tmp_path)
+
+
+def test_a_number_that_no_column_replaces_or_that_was_said_of_both_directions_gives_way(tmp_path: Path) -> None:
+    _write(tmp_path, _CSV)
+    trace = read_trace(tmp_path / "link.csv")
+    table = {"preset": "wifi_bad", "jitter_ms": 0, "delay_ms": 7, "uplink": {"trace": "link.csv", "queue_ms": 50}}
+    conditions = parse_network(table, directory=tmp_path)
+    assert conditions.uplink == DirectionConditions(queue_ms=50, trace=trace)
+    assert conditions.downlink == DirectionConditions(delay_ms=7, loss=0.02, rate_mbit=12)
+    # A trace of one direction that does not say all of it leaves the rest to the table.
+    (tmp_path / "loss.csv").write_text("time_s,loss\n0,0\n1,1\n", encoding="utf-8")
+    assert parse_network({"trace": "loss.csv", "delay_ms": 7}, directory=tmp_path).uplink.delay_ms == 7
+
+
+def test_conditions_with_a_number_and_a_column_of_the_same_are_refused_however_they_are_made() -> None:
+    with pytest.raises(ConfigError, match=r"network\.loss = 0\.5: the trace t has a column loss"):
+        DirectionConditions(loss=0.5, trace=Trace("t", (0, 1), loss=(0, 1)))
 
 
 @pytest.mark.parametrize(
