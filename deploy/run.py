@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -103,20 +104,26 @@ def launch(options: LaunchOptions, stop: StopSignals, console: Console) -> int:
         ) as network_link:
             configurations = plan_run(request, port_map, network_link, options.conditions)
             paths = write_tables(run_dir / "config", configurations)
-            run_file(options, configurations, network_link).write(run_dir)
+            facts = run_file(options, configurations, network_link)
+            facts.write(run_dir)
             services = launched_services(paths, request.placement, network_link)
             console.line(f"run directory: {run_dir}")
             steps_total = configurations[ROBOT_BRIDGE].robot_bridge.steps
             reader = ProgressReader(run_dir, steps_total)
 
             def early_end() -> EarlyEnd | None:
-                failure = network_link.failure()
-                return EarlyEnd(f"the emulated network has failed, and so the run ends: {failure}") if failure else None
+                if failure := network_link.failure():
+                    return EarlyEnd(f"the emulated network has failed, and so the run ends: {failure}")
+                over = network_link.over()
+                return EarlyEnd(f"the run ends: {over}", is_failure=False) if over else None
 
             failures = watch(
                 services, reader, run_dir, drawing, stop, console, early_end=early_end, report=console.error
             )
+            ended_early = "interrupted" if stop.asked else network_link.failure() or network_link.over()
     # The network has been closed: its part of the record is final.
+    if ended_early:
+        _write_again(replace(facts, ended_early=ended_early), run_dir, console)
     complete = summarise_run(run_dir, drawing, stop, console)
     if stop.asked:
         return INTERRUPTED
@@ -171,6 +178,13 @@ def run_file(options: LaunchOptions, configurations: Mapping[str, Any], network_
         versions=versions(),
         host_budget=options.request.learner_host.name if options.request.learner_host else "",
     )
+
+
+def _write_again(facts: RunFile, run_dir: Path, console: Console) -> None:
+    try:
+        facts.write(run_dir)
+    except OSError as error:
+        console.error(f"deploy.launch: error: {run_dir / 'run.toml'}: cannot be written: {error.strerror}")
 
 
 def _shortened(path: Path) -> Path:

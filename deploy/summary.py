@@ -52,6 +52,8 @@ def summarise(record: Record) -> Summary:
     run = record.run
     steps = _count(parts.latest(ROBOT_BRIDGE, "steps"))
     has_goal = run_parts.newest_detail(parts, ROBOT_BRIDGE, "has_goal")
+    if run and run.ended_early and (steps or 0) < run.steps:
+        notes.append(f"the run was cut short, at {steps or 0} of {run.steps} steps: {run.ended_early}")
     produced, persisted = run_parts.produced(parts), _persisted(record)
     if persisted is None:
         warnings.append("what replay has persisted is not known: it left no last word, and there is no ring here")

@@ -17,6 +17,7 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -66,7 +67,7 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
     if stop:
         load_libraries(plan.configurations[LEARNER].algorithm.name, stop)
     plan = plan.with_computing_times()
-    plan.write(run_dir)
+    facts = plan.write(run_dir)
     steps = plan.configurations[ROBOT_BRIDGE].robot_bridge.steps
     reader = ProgressReader(run_dir, steps)
     next_progress_s = 0.0
@@ -91,6 +92,8 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
                 shutil.rmtree(run_dir, ignore_errors=True)
             raise
         raise ServiceError(f"{error}; see {log}. python -m deploy.summary {run_dir} shows what there is") from error
+    if begun.told_to_stop:
+        replace(facts, ended_early=begun.told_to_stop).write(run_dir)
     summary = summarise(read_record(run_dir))
     paths = [write_summary(run_dir, summary), write_curve(run_dir, summary)]
     if console:

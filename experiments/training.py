@@ -83,12 +83,12 @@ class PlannedTraining:
             return VirtualRun(self.configurations, self.placement, self.conditions)
         return LockstepRun(self.configurations)
 
-    def write(self, run_dir: Path) -> None:
-        """Write the configurations and ``run.toml``."""
+    def write(self, run_dir: Path) -> RunFile:
+        """Write the configurations and ``run.toml``; return what stands in the latter."""
         bridge = self.configurations[ROBOT_BRIDGE]
         for service, configuration in self.configurations.items():
             write_atomically(run_dir / "config" / f"{service}.toml", tomli_w.dumps(to_tables(configuration)))
-        RunFile(
+        facts = RunFile(
             id=bridge.run.id,
             mode=self.placement.mode if self.virtual else IN_PROCESS,
             task=bridge.task.name,
@@ -102,7 +102,9 @@ class PlannedTraining:
             conditions=self.conditions.to_table() if self.conditions else {},
             versions=versions(),
             host_budget=self.learner_host.name if self.learner_host else "",
-        ).write(run_dir)
+        )
+        facts.write(run_dir)
+        return facts
 
 
 def plan_training(training: Training) -> PlannedTraining:

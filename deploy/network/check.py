@@ -223,7 +223,7 @@ def _exchange(check: Check, network_link: NetworkLink, ports: dict[Direction, in
             senders.append(_start(stack, network_link, host, role, directory / f"{direction}.sent"))
         deadline_s = time.monotonic() + check.seconds + _GRACE_S
         while any(sender.poll() is None for sender in senders):
-            if reason := network_link.failure():
+            if reason := network_link.failure() or network_link.over():
                 raise LinkFailedError(f"{check.backend} {check.network}: {reason}")
             if time.monotonic() > deadline_s:
                 raise LinkFailedError(f"{check.backend} {check.network}: not over {_GRACE_S:.0f} s after it should be")

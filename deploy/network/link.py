@@ -64,6 +64,10 @@ class NetworkLink(Protocol):
         """Why the open link carries nothing any more; None while all is well."""
         ...
 
+    def over(self) -> str | None:
+        """Why the run ends with the open link as it now is, all being well: a trace that stops; None if it goes on."""
+        ...
+
 
 class NoLink:
     """No emulated network: every host is this machine, and nothing delays anything."""
@@ -92,4 +96,7 @@ class NoLink:
         return None
 
     def failure(self) -> str | None:
+        return None
+
+    def over(self) -> str | None:
         return None

@@ -71,12 +71,16 @@ class LinkProcess:
             raise LinkFailedError(f"{self._part_path}: not there; the link has never been up") from error
 
     def failure(self) -> str | None:
-        """Why the link is over: its process has ended by itself, or a trace that stops. None once it was stopped."""
+        """Why the process has ended by itself; None if it has not, or was stopped."""
+        if self._process is None or self._process.poll() is None:
+            return None
+        return f"{self._module} ended with exit code {self._process.returncode}: {self._log_tail()}"
+
+    def over(self) -> str | None:
+        """See :func:`trace_over`; None once the process was stopped."""
         if self._process is None:
             return None
-        if self._process.poll() is None:
-            return trace_over(self._conditions, time.monotonic_ns() - self._start_monotonic_ns)
-        return f"{self._module} ended with exit code {self._process.returncode}: {self._log_tail()}"
+        return trace_over(self._conditions, time.monotonic_ns() - self._start_monotonic_ns)
 
     def stop(self) -> None:
         """End the process; harmless if it has ended or was never started."""

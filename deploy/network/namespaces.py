@@ -158,6 +158,9 @@ class NamespaceLink(NamespaceHosts):
     def failure(self) -> str | None:
         return self._process.failure()
 
+    def over(self) -> str | None:
+        return self._process.over()
+
     def _join(self) -> None:
         for host in HOSTS:
             run_command("ip", "-n", namespace_name(host), "tuntap", "add", "dev", DEVICE, "mode", "tun")

@@ -58,6 +58,9 @@ class NetemLink(NamespaceHosts):
     def failure(self) -> str | None:
         return None
 
+    def over(self) -> str | None:
+        return None
+
     def _join(self) -> None:
         for command in join_commands(self._conditions):
             try:

@@ -76,3 +76,6 @@ class RelayLink:
 
     def failure(self) -> str | None:
         return self._process.failure()
+
+    def over(self) -> str | None:
+        return self._process.over()

@@ -90,7 +90,11 @@ def test_ctrl_c_ends_all_and_completes_the_record(tmp_path: Path, number: signal
     assert code == 130
     assert not any(map(is_running, pids))
     assert (tmp_path / "run" / "ends.log").read_text().startswith("robot_bridge SIGINT\n")
-    assert json.loads((tmp_path / "run" / "summary.json").read_text())["steps"] == 100
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["steps"] == 100
+    assert any(
+        re.fullmatch(r"the run was cut short, at 100 of \d+ steps: interrupted", note) for note in summary["notes"]
+    )
     assert "summary.json" in out
 
 
@@ -141,6 +145,21 @@ def test_a_mode_with_two_hosts_runs_over_an_emulated_network(tmp_path: Path) -> 
         for name in SERVICES
     ]
     assert buffers == [128] * 4
+
+
+def test_a_trace_that_is_over_ends_the_run_in_order_and_the_record_says_that_it_was_cut_short(tmp_path: Path) -> None:
+    (tmp_path / "short.csv").write_text("time_s,delay_ms\n0,1\n0.01,1\n", encoding="utf-8")
+    network = tmp_path / "network.toml"
+    network.write_text('[network]\ntrace = "short.csv"\ntrace_end = "stop"\n', encoding="utf-8")
+    run_dir = tmp_path / "run"
+    code, out, errors = finish(start_launcher(run_dir, "--steps", "300", "--network", str(network), mode="remote_only"))
+    reason = f"the trace {tmp_path / 'short.csv'} is over after 0.02 s, and trace_end = 'stop'; 'loop' begins it again"
+    assert code == 0, errors
+    assert f"the run ends: {reason}\n" in errors
+    assert "failed" not in out + errors
+    note = f"the run was cut short, at 100 of 300 steps: {reason}"
+    assert note in json.loads((run_dir / "summary.json").read_text())["notes"]
+    assert f"note       {note}" in out
 
 
 def test_write_config_writes_and_prints_what_to_type(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

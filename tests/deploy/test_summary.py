@@ -243,6 +243,20 @@ def test_what_is_missing_is_null_with_a_warning(tmp_path: Path) -> None:
         assert missing in text
 
 
+def test_a_run_that_was_cut_short_says_so_and_why(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    cut = replace(RUN, steps=4000, ended_early="the trace t.csv is over after 4 s")
+    cut.write(tmp_path)
+    values = summarise(read_record(tmp_path)).values
+    note = "the run was cut short, at 3000 of 4000 steps: the trace t.csv is over after 4 s"
+    assert note in values["notes"]
+    assert f"note       {note}" in summary_text(values)
+    # What was told to end when it had made all its steps was not cut short.
+    for whole in (replace(cut, steps=3000), replace(cut, ended_early="")):
+        whole.write(tmp_path)
+        assert not any("cut short" in note for note in summarise(read_record(tmp_path)).values["notes"])
+
+
 @pytest.mark.parametrize("name", ["run.toml", "network.json", "ring", "parts/learner-150.json", "actions.csv"])
 def test_a_damaged_piece_costs_only_what_is_in_it(tmp_path: Path, name: str) -> None:
     write_run(tmp_path)

@@ -12,6 +12,7 @@ import pytest
 from common.errors import ConfigError
 from deploy.console import Console
 from deploy.episodes import EpisodeTable
+from deploy.summary import read_record, summarise
 from experiments.train import Training, main, train
 
 INFERENCE_S, UPDATE_S = 0.001, 0.005
@@ -70,6 +71,9 @@ def test_a_trace_that_stops_ends_the_run_in_order(tmp_path, capsys):
     assert values["experience"]["lost"] == 0
     assert "short.csv is over after 2 s" in (tmp_path / "run" / "logs" / "train.log").read_text(encoding="utf-8")
     assert f"the run has ended early: the trace {trace} is over after 2 s" in capsys.readouterr().err
+    cut_short = f"the run was cut short, at {values['steps']} of 150 steps: the trace {trace} is over after 2 s"
+    for notes in (values["notes"], summarise(read_record(tmp_path / "run")).values["notes"]):
+        assert any(note.startswith(cut_short) for note in notes)
 
 
 def test_a_congestion_control_is_refused_because_nobody_would_have_it(tmp_path):

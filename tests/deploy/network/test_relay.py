@@ -179,9 +179,10 @@ def test_a_trace_that_stops_ends_the_link_and_one_that_loops_does_not(tmp_path: 
         conditions = NetworkConditions(DirectionConditions(trace=trace))
         with RelayLink(conditions, tmp_path, [Crossing("local", "remote", port)]) as network_link:
             time.sleep(0.002)  # the trace's own time
-            failure = network_link.failure()
-            assert (failure or "").startswith(reason or "")
-            assert (failure is None) == (reason is None)
+            assert network_link.failure() is None
+            over = network_link.over()
+            assert (over or "").startswith(reason or "")
+            assert (over is None) == (reason is None)
 
 
 def test_a_relay_that_died_is_a_failure(tmp_path: Path, port: int) -> None:
@@ -192,5 +193,6 @@ def test_a_relay_that_died_is_a_failure(tmp_path: Path, port: int) -> None:
         os.kill(process.pid, signal.SIGKILL)
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
         failure = network_link.failure()
+        assert network_link.over() is None
     assert failure is not None
     assert "exit code -9" in failure
