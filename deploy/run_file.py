@@ -6,7 +6,7 @@ import platform
 import subprocess
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import datetime
 from importlib import metadata
 from pathlib import Path
@@ -64,7 +64,7 @@ class RunFile:
 
     def write(self, run_dir: Path) -> None:
         """Write ``run_dir/run.toml``, and its network's traces beside it."""
-        facts = asdict(self)
+        facts = dict(vars(self))
         tables = {name: facts.pop(name) for name in ("placement", "conditions", "versions")}
         tables["conditions"] = recorded_table(tables["conditions"], run_dir)
         document = {"run": facts, **_without_none(tables)}

@@ -118,7 +118,7 @@ def run_check(parsed: argparse.Namespace, say: Callable[[str], None] = _say) -> 
             measured.add(backend)
             for row in rows:
                 say(row_text(check.network, row))
-            misses += [f"{backend} {check.network} {row.direction} {row.quantity}" for row in rows if not row.ok]
+            misses += [f"{backend} {check.network} {row.direction} {row.quantity}" for row in rows if row.misses]
         say("")
     if unmeasured := [backend for backend in parsed.backend or () if backend not in measured]:
         say(f"not measured: {', '.join(unmeasured)}")
@@ -140,9 +140,10 @@ HEADING = f"{'network':<12} {'direction':<9} {'quantity':<10} {'expected':>10} {
 def row_text(network: str, row: Row) -> str:
     """One line of the table below :data:`HEADING`."""
     measured = "nothing" if row.measured is None else f"{row.measured:.3f}"
+    verdict = f"MISSES {row.note}".rstrip() if row.misses else "ok" if row.ok else "cannot be measured: all is lost"
     return (
         f"{network:<12} {row.direction:<9} {row.quantity:<10} {row.expected:>10.3f} {measured:>10} "
-        f"{f'± {row.allowed:.3f}':>10} {row.unit:<6} {'ok' if row.ok else f'MISSES {row.note}'.rstrip()}"
+        f"{f'± {row.allowed:.3f}':>10} {row.unit:<6} {verdict}"
     )
 
 
@@ -163,6 +164,9 @@ def measure(check: Check, seed: int = 0) -> list[Row]:
         LinkFailedError: it did not last, or a probe failed.
     """
     transport = _TRANSPORT[check.backend]
+    for direction in DIRECTIONS:
+        if transport == "stream" and check.conditions.direction(direction).silent:
+            raise LinkUnavailable(f"everything in the {direction} is lost (loss = 1): no stream gets through there")
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
         with _open(check.backend, check.conditions, directory, seed) as (network_link, ports):

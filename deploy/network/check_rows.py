@@ -51,10 +51,18 @@ class Row:
     """How far off it may be."""
     note: str = ""
     """What a miss may come from, apart from the link."""
+    silent: bool = False
+    """Whether the table lets nothing through, so that there can be nothing to measure."""
 
     @property
     def ok(self) -> bool:
+        """Whether it is as the table says."""
         return self.measured is not None and abs(self.measured - self.expected) <= self.allowed
+
+    @property
+    def misses(self) -> bool:
+        """Whether it is not as the table says; what cannot be measured is neither."""
+        return not self.ok and not (self.silent and self.measured is None)
 
 
 @dataclass(frozen=True)
@@ -106,6 +114,7 @@ def _delay(crossed: Crossed) -> Row:
         expected=expected,
         measured=statistics.fmean(measured_ms) if measured_ms else None,
         allowed=max(DELAY_TOLERANCE * expected, SIGMAS * error_ms, OWN_DELAY_MS),
+        silent=one_way.silent,
     )
 
 
@@ -176,6 +185,7 @@ def _rate(crossed: Crossed) -> Row:
         measured=None if measured is None else measured * 8 / 1e6,
         allowed=RATE_TOLERANCE * expected * 8 / 1e6,
         note=note,
+        silent=one_way.silent,
     )
 
 

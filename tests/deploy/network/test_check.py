@@ -104,6 +104,23 @@ def test_traffic_in_both_directions_meets_its_own_conditions(request: pytest.Fix
         assert 10 <= downlink < uplink
 
 
+def test_what_cannot_be_measured_because_all_is_lost_is_no_miss(
+    answers: dict[tuple[str, str], Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    lost = Row("mean delay", "uplink", "ms", expected=3.0, measured=None, allowed=0.3, silent=True)
+    answers["namespaces", "lan"] = [_row(2.1), lost]
+    assert program.main(["check", "--network", "lan"]) == 0
+    output = capsys.readouterr().out
+    assert "± 0.300 ms     cannot be measured: all is lost\n" in output
+    assert "MISSES" not in output
+
+
+def test_over_a_relay_that_lets_nothing_through_nothing_is_measured() -> None:
+    conditions = NetworkConditions(downlink=DirectionConditions(loss=1))
+    with pytest.raises(LinkUnavailable, match=r"everything in the downlink is lost \(loss = 1\)"):
+        measure(Check("relay", "test", conditions))
+
+
 def test_a_trace_that_stops_during_a_check_ends_it() -> None:
     conditions = NetworkConditions(DirectionConditions(trace=Trace("short.csv", (0, 0.01), loss=(0, 0), end="stop")))
     with pytest.raises(LinkFailedError, match=r"relay test: the trace short\.csv is over after 0\.02 s"):

@@ -137,6 +137,25 @@ def test_a_sender_that_was_too_slow_is_named_with_the_miss() -> None:
     assert row.note == "only 11.4 Mbit/s were sent: this computer is too slow or too busy to tell"
 
 
+def test_of_a_link_that_loses_everything_only_the_loss_can_be_measured() -> None:
+    sent = [(_number(phase, i), _START_NS + i * 10 * _MS) for phase in (DELAY, LOSS, RATE) for i in range(100)]
+    for one_way in (
+        DirectionConditions(delay_ms=5, loss=1, rate_mbit=8),
+        DirectionConditions(delay_ms=5, rate_mbit=8, trace=Trace("t", (0, 1), loss=(1, 1))),
+    ):
+        rows = _crossed(one_way, sent, [])
+        assert {quantity: row.ok for quantity, row in rows.items()} == {
+            "mean delay": False,
+            "loss": True,
+            "rate": False,
+        }
+        assert not any(row.misses for row in rows.values())
+        assert rows["loss"].measured == rows["loss"].expected == 100
+        came = _crossed(one_way, sent, [(number, time_ns, time_ns) for number, time_ns in sent])
+        assert came["mean delay"].misses
+        assert came["loss"].misses
+
+
 def test_nothing_that_came_is_a_miss() -> None:
     sent, _ = _losses(100, 0)
     rows = _crossed(DirectionConditions(delay_ms=5, rate_mbit=8), sent, [])
