@@ -7,7 +7,7 @@ import pytest
 from common import topics
 from common.run_settings import RunSettings
 from common.topics import ACTOR, LEARNER, REPLAY, ROBOT_BRIDGE
-from deploy.network import DirectionConditions, NetworkConditions
+from deploy.network import DirectionConditions, NetworkConditions, Trace
 from experiments.simulation import START_NS, SimulatedClock
 from experiments.virtual_network import LIMITED_BUFFER_BYTES, MESSAGE_OVERHEAD_BYTES, VirtualLink, VirtualNetwork
 from experiments.virtual_tcp import HEADER_BYTES
@@ -68,6 +68,17 @@ def test_what_crosses_takes_its_direction_s_delay_and_the_way_through_the_proces
     office.put(ACTOR, topics.ACTION)
     office.sleep()
     assert office.heard == [(ACTOR, 10 + MESSAGE_MS), (ROBOT_BRIDGE, 30 + MESSAGE_MS)]
+
+
+def test_a_message_does_not_look_at_every_row_of_a_trace(scene, monkeypatch):
+    traced = scene(REMOTE_ONLY, uplink=DirectionConditions(trace=Trace("t", (0, 1), delay_ms=(5, 6), rate_mbit=(8, 8))))
+    monkeypatch.setattr(Trace, "mean", None)  # whose time grows with the rows
+    traced.listen(ACTOR, topics.TIME_STEP)
+    traced.put(ROBOT_BRIDGE, topics.TIME_STEP)
+    traced.sleep()
+    # A byte takes 1 us at 8 Mbit/s.
+    on_air_ms = (len(b"message") + MESSAGE_OVERHEAD_BYTES + HEADER_BYTES) / 1e3
+    assert traced.heard == [(ACTOR, pytest.approx(5 + on_air_ms + MESSAGE_MS))]
 
 
 def test_what_stays_on_a_host_does_not_meet_the_link(scene):
