@@ -73,6 +73,8 @@ class Service:
         """Set by a signal, a ``stop`` command, or a newer incarnation of this service."""
         self.failure: str | None = None
         """Why the service has to end with exit code 1."""
+        self.note: str | None = None
+        """What people should know of this service's end that is no failure."""
         self.wake = self.clock.condition()
         """Notified when a message has arrived or the service is asked to stop."""
         self.state = "starting"
@@ -144,14 +146,18 @@ class Service:
         if self._heart.is_alive():
             self._heart.join()
         self._send_status()
-        self.write_record()
-        self.record.close()
-        if not self.record.dropped:
-            self.closing.close()
+        self.close_record()
         # Zenoh tries for long to say goodbye over a dead link; nobody is there who could hear it.
         closing = threading.Thread(target=self.transport.close, name="close", daemon=True)
         closing.start()
         closing.join(CLOSE_TIMEOUT_S)
+
+    def close_record(self) -> None:
+        """Write the last part; then release what was kept up to it."""
+        self.write_record()
+        self.record.close()
+        if not self.record.dropped:
+            self.closing.close()
 
     @property
     def finished(self) -> Finished | None:
@@ -322,6 +328,7 @@ class Service:
             {
                 "state": self.state,
                 "failure": self.failure,
+                **({"note": self.note} if self.note else {}),
                 "run": self.run.id,
                 "wall_s": round(wall_s, 3),
                 "counters": counters,

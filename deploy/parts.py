@@ -141,6 +141,12 @@ def clock_jumps(parts: RunParts) -> dict[str, int]:
     return {service: count for service, count in counts.items() if count}
 
 
+def service_notes(parts: RunParts) -> list[str]:
+    """What the newest incarnations say of their end that is no failure."""
+    newest = (parts.newest(service) for service in SERVICES)
+    return [f"{part['service']} {part['note']}" for part in newest if part is not None and part.get("note")]
+
+
 def service_failures(parts: RunParts) -> list[dict[str, Any]]:
     """Incarnations that failed, or never said that they had stopped, or whose word cannot be read."""
     unknown = "its part of the record is empty or damaged: its counts are unknown"

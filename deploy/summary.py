@@ -68,6 +68,7 @@ def summarise(record: Record) -> Summary:
         notes.append(f"{service}: its clock and the bridge's jumped against each other ({jumps} x)")
     if stalls := _count(parts.total(ROBOT_BRIDGE, "camera_stalls")):
         notes.append(f"the camera stalled ({stalls} x); attempts that it befell were truncated")
+    notes += run_parts.service_notes(parts)
     values = {
         "task": run.task if run else run_parts.newest_detail(parts, ROBOT_BRIDGE, "task"),
         "algorithm": run.algorithm if run else None,

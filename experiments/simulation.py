@@ -22,13 +22,19 @@ START_NS = 1_000_000_000
 
 
 class SimulationEnded(BaseException):
-    """Ends a simulated thread wherever it waits; no ``except Exception`` of a service may stop it."""
+    """Ends a simulated thread wherever it waits; no ``except Exception`` of a service may stop it.
+
+    The first thread gets it only from an interruption.
+    """
 
 
 class SimulatedClock:
     """The clock, and the scheduler, of a simulation. The thread that makes it is the first to run."""
 
     def __init__(self) -> None:
+        self.interrupted: Callable[[], bool] = lambda: False
+        """Asked whenever a thread waits. Once it says so the first thread is next, whatever else is due, and its waits
+        raise :class:`SimulationEnded`."""
         self._now_ns = START_NS
         self._order = itertools.count()
         self._timers: list[tuple[int, int, Callable[[], None]]] = []
@@ -100,10 +106,12 @@ class SimulatedClock:
             self._running = following
             following.baton.release()
             turn.baton.acquire()
-        if self._ended and turn is not self._first:
+        if self.interrupted() if turn is self._first else self._ended:
             raise SimulationEnded
 
     def _next(self) -> _Turn:
+        if self.interrupted():
+            return self._first
         while not self._ready:
             if not self._timers:
                 raise RuntimeError("every simulated thread waits for another one")

@@ -85,7 +85,7 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
     try:
         with _log_to(log):
             begun = plan.begin()
-            begun.run(look)
+            begun.run(look, lambda: stop is not None and stop.asked_again)
     except RelodError as error:
         if begun is None or isinstance(error, ConfigError):
             if is_new:  # Nothing has begun: the corrected command may use the same folder.
@@ -99,6 +99,8 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
     if console:
         if begun.told_to_stop and summary.values["steps"] < steps:
             console.error(f"experiments.train: the run has ended early: {begun.told_to_stop}")
+        if begun.cut_off:
+            console.error(f"experiments.train: the services were cut off: {begun.cut_off}")
         for warning in summary.warnings:
             console.error(f"experiments.train: warning: {warning}")
         console.line(summary_text(summary.values))

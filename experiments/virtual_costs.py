@@ -8,7 +8,9 @@ to be the same every time cannot measure its own times. Each run's record has th
 
 from __future__ import annotations
 
+import fcntl
 import json
+import math
 import os
 import platform
 import time
@@ -98,19 +100,38 @@ def measure(spec: TaskSpec, learner: Any) -> ComputingTimes:
 
 
 def _measured_once(spec: TaskSpec, learner: Any) -> ComputingTimes:
-    """Measure, or return what an earlier call has measured on this computer."""
-    path = _cache_path()
-    try:
-        known = dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):  # There is none yet, or none that can be used.
-        known = {}
-    key = _key(spec, learner)
-    try:
-        return ComputingTimes(**known[key])
-    except (KeyError, TypeError):
-        times = measure(spec, learner)
-        write_atomically(path, json.dumps({**known, key: asdict(times)}, indent=1, sort_keys=True) + "\n")
+    """Measure, or return what an earlier call has measured on this computer, also one that is measuring now."""
+    path, key = _cache_path(), _key(spec, learner)
+    if times := _known_times(path).get(key):
         return times
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Who comes meanwhile waits: two measurements would be two results, and each would disturb the other.
+    with path.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        known = _known_times(path)
+        if key not in known:
+            known[key] = measure(spec, learner)
+            table = {name: asdict(times) for name, times in known.items()}
+            write_atomically(path, json.dumps(table, indent=1, sort_keys=True) + "\n")
+        return known[key]
+
+
+def _known_times(path: Path) -> dict[str, ComputingTimes]:
+    """What has been measured so far; what cannot be understood of it is left out, and measured again."""
+    try:
+        table = dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):  # There is none yet, or none that can be used.
+        return {}
+    names = {field.name for field in fields(ComputingTimes)}
+    return {
+        key: ComputingTimes(**times)
+        for key, times in table.items()
+        if isinstance(times, dict) and times.keys() == names and all(map(_is_duration, times.values()))
+    }
+
+
+def _is_duration(value: object) -> bool:
+    return isinstance(value, float) and math.isfinite(value) and value > 0
 
 
 def _cache_path() -> Path:

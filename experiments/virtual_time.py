@@ -57,7 +57,7 @@ class VirtualRun(InProcessRun):
         network = VirtualNetwork(clock, placement.host, self._link, MESSAGE_S, CROSSING_S)
         super().__init__(configurations, clock, network)
 
-    def run(self, look: Callable[[InProcessRun], None]) -> None:
+    def run(self, look: Callable[[InProcessRun], None], hurried: Callable[[], bool] = lambda: False) -> None:
         """See :class:`InProcessRun`; ends with a trace that stops, and leaves the link's part of the record."""
 
         def look_at_link_too(run: InProcessRun) -> None:
@@ -66,7 +66,7 @@ class VirtualRun(InProcessRun):
                 self.stop(over)
 
         try:
-            super().run(look_at_link_too)
+            super().run(look_at_link_too, hurried)
         finally:
             if self._link is not None:
                 write_atomically(self._run_dir / "network.json", self._link.part().to_json())

@@ -8,7 +8,7 @@ import pytest
 
 from common import topics
 from common.run_settings import RunSettings
-from experiments.simulation import START_NS, SimulatedClock, SimulatedNetwork
+from experiments.simulation import START_NS, SimulatedClock, SimulatedNetwork, SimulationEnded
 
 SECOND_NS = 1_000_000_000
 
@@ -52,6 +52,24 @@ def test_threads_run_one_after_the_other_and_time_jumps_to_the_next_deadline(sce
         thread.join()
     # At six seconds both are due; b asked first, at three seconds.
     assert scene.said == [(2, "a"), (3, "b"), (4, "a"), (6, "b"), (6, "a"), (9, "b")]
+
+
+def test_an_interruption_ends_the_wait_of_the_first_thread_though_others_never_stop(scene):
+    turns = 0
+
+    def go_on():
+        nonlocal turns
+        while True:
+            turns += 1
+            scene.sleep(0.0)  # No time passes, so no deadline comes.
+
+    (thread,) = scene.start(go_on)
+    scene.clock.interrupted = lambda: turns == 1000
+    with pytest.raises(SimulationEnded):
+        scene.sleep(1.0)
+    assert (turns, scene.clock.now_ns(), thread.is_alive()) == (1000, START_NS, True)
+    scene.clock.end()
+    assert (turns, thread.is_alive()) == (1000, False)
 
 
 def test_an_hour_passes_without_waiting(scene):

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import subprocess
+import sys
 from datetime import datetime
 from pathlib import Path
 
@@ -70,11 +74,54 @@ def test_what_is_set_is_not_measured(measured):
     assert measured == []
 
 
-def test_a_cache_that_cannot_be_read_is_replaced(measured, cache):
+@pytest.mark.parametrize("damage", ['{"half a', b"\xff", "[1]", "7", ""])
+def test_a_cache_that_cannot_be_read_is_replaced(measured, cache, damage):
     cache.parent.mkdir()
-    cache.write_text('{"half a')
+    cache.write_bytes(damage if isinstance(damage, bytes) else damage.encode())
     assert times(with_computing_times(configurations(), None)) == (0.002, 0.02)
     assert '"update_s": 0.02' in cache.read_text()
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [None, 7, {}, {"inference_s": 0.1}, *({"inference_s": 0.1, "update_s": bad} for bad in (None, "1", -1.0, 0.0))],
+)
+def test_an_entry_that_is_no_measurement_is_measured_again_and_the_others_stay(measured, cache, entry):
+    with_computing_times(configurations(), None)
+    with_computing_times(configurations("algorithm.hidden_size=8"), None)
+    known = json.loads(cache.read_text())
+    damaged = next(key for key in known if known[key]["inference_s"] == 0.002)
+    cache.write_text(json.dumps({**known, damaged: entry}))
+    assert times(with_computing_times(configurations(), None)) == (0.006, 0.06)
+    assert times(with_computing_times(configurations("algorithm.hidden_size=8"), None)) == (0.004, 0.04)
+    assert len(measured) == 3
+
+
+def test_processes_that_begin_together_use_one_measurement(cache):
+    with contextlib.ExitStack() as stack:
+
+        def begin(value: str) -> subprocess.Popen[str]:
+            return stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-m", "tests.experiments.measuring_process", value],
+                    cwd=Path(__file__).parents[2],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    text=True,
+                )
+            )
+
+        one = begin("0.25")
+        while one.stdout.readline().strip() != "measures":
+            assert one.poll() is None
+        # It goes on measuring until the other has found nothing in the cache.
+        other = begin("0.5")
+        assert other.stdout.readline().strip() in ("asks for the lock", "measures")
+        one.stdin.close()
+        other.stdin.close()
+        results = [process.stdout.read().splitlines()[-1] for process in (one, other)]
+    assert results == ["(0.25, 0.25)", "(0.25, 0.25)"]
+    assert cache.read_text().count("update_s") == 1
 
 
 def test_another_computer_updates_as_often_as_its_file_says_and_is_not_measured(measured):

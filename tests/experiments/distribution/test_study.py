@@ -132,6 +132,17 @@ def test_a_run_that_ended_early_is_no_result(tmp_path, monkeypatch):
         work({"runs": str(tmp_path), job.setting: run_settings}, job.key)
 
 
+def test_a_run_over_a_link_that_goes_down_for_good_ends_and_is_no_result(tmp_path):
+    trace, network = tmp_path / "dead.csv", tmp_path / "network.toml"
+    trace.write_text("time_s,loss\n0,0\n1,1\n", encoding="utf-8")
+    network.write_text(f'[network]\ntrace = "{trace}"\ntrace_end = "stop"\n', encoding="utf-8")
+    job = Job(REMOTE_LOCAL.name, "dot_reacher", 150, 0)
+    run_settings = {"algorithm": "sac", "mode": "remote_only", "host": "laptop", "overrides": []}
+    run_settings["network"] = str(network)
+    with pytest.raises(DistributionError, match="expected 150 steps"):
+        work({"runs": str(tmp_path), job.setting: run_settings}, job.key)
+
+
 def test_a_plan_runs_nothing_and_says_how_long_it_takes(tmp_path, capsys):
     assert main(["--plan", "--out", str(tmp_path / "out"), "--workers", "2"], {"hand_made": HAND_MADE}) == 0
     assert "6 jobs, about" in capsys.readouterr().out
