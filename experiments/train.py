@@ -80,12 +80,15 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
         if stop and stop.asked:
             run.stop("interrupted")
 
+    def hurried() -> bool:
+        return stop is not None and stop.asked_again
+
     log = run_dir / "logs" / "train.log"
     begun: InProcessRun | None = None
     try:
         with _log_to(log):
             begun = plan.begin()
-            begun.run(look, lambda: stop is not None and stop.asked_again)
+            begun.run(look, hurried)
     except RelodError as error:
         if begun is None or isinstance(error, ConfigError):
             if is_new:  # Nothing has begun: the corrected command may use the same folder.
@@ -95,12 +98,16 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
     if begun.told_to_stop:
         replace(facts, ended_early=begun.told_to_stop).write(run_dir)
     summary = summarise(read_record(run_dir))
-    paths = [write_summary(run_dir, summary), write_curve(run_dir, summary)]
+    paths = [write_summary(run_dir, summary)]
+    if not hurried():
+        paths.append(write_curve(run_dir, summary))
     if console:
         if begun.told_to_stop and summary.values["steps"] < steps:
             console.error(f"experiments.train: the run has ended early: {begun.told_to_stop}")
         if begun.cut_off:
             console.error(f"experiments.train: the services were cut off: {begun.cut_off}")
+        if len(paths) < 2:
+            console.error(f"no time to draw the learning curve; python -m deploy.summary {run_dir} does")
         for warning in summary.warnings:
             console.error(f"experiments.train: warning: {warning}")
         console.line(summary_text(summary.values))

@@ -142,7 +142,10 @@ def test_a_service_that_hears_of_the_end_late_is_left_to_its_own_end(tmp_path):
 def test_who_asks_to_stop_a_second_time_does_not_wait(dead, tmp_path, capsys):
     values = train(small(tmp_path / "run", dead), Console(), StopAfter(4, further_looks=5))
     assert link_lasted_s(tmp_path / "run") == pytest.approx(9, abs=1.1)
-    assert "the services were cut off: asked once more to stop" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "the services were cut off: asked once more to stop" in said
+    assert "no time to draw the learning curve" in said
+    assert not (tmp_path / "run" / "learning_curve.png").exists()
     failures = {failure["service"]: failure["failure"] for failure in values["service_failures"]}
     # The bridge had ended, 2 s after it was asked.
     assert failures == dict.fromkeys(REMOTE, "cut off in state 'running': asked once more to stop")
