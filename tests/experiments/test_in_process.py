@@ -171,7 +171,7 @@ def test_a_service_that_does_not_end_though_it_is_told_to_is_cut_off(tmp_path, m
     assert "the end of the run has taken more than 80 s" in values["service_failures"][0]["failure"]
 
 
-def test_a_robot_that_can_make_no_step_ends_the_run_as_a_failure(dead, tmp_path, monkeypatch):
+def test_a_robot_that_can_make_no_step_ends_the_run_as_a_failure(tmp_path, monkeypatch):
     monkeypatch.setattr(in_process, "STANDSTILL_S", 60.0)
     never = link(tmp_path, "0,1", "86400,1")
     reason = "no step for 60 s of simulated time, at 0 steps: the robot waits for actor and replay"
