@@ -88,15 +88,17 @@ def train(training: Training, console: Console | None = None, stop: StopSignals 
     try:
         with _log_to(log):
             begun = plan.begin()
-            begun.run(look, hurried)
+            try:
+                begun.run(look, hurried)
+            finally:
+                if begun.told_to_stop:
+                    replace(facts, ended_early=begun.told_to_stop).write(run_dir)
     except RelodError as error:
         if begun is None or isinstance(error, ConfigError):
             if is_new:  # Nothing has begun: the corrected command may use the same folder.
                 shutil.rmtree(run_dir, ignore_errors=True)
             raise
         raise ServiceError(f"{error}; see {log}. python -m deploy.summary {run_dir} shows what there is") from error
-    if begun.told_to_stop:
-        replace(facts, ended_early=begun.told_to_stop).write(run_dir)
     summary = summarise(read_record(run_dir))
     paths = [write_summary(run_dir, summary)]
     if not hurried():

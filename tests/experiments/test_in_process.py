@@ -179,4 +179,5 @@ def test_a_robot_that_can_make_no_step_ends_the_run_as_a_failure(tmp_path, monke
         train(small(tmp_path / "run", never))
     values = summarise(read_record(tmp_path / "run")).values
     assert (values["steps"], values["experience"]["produced"]) == (0, 0)
+    assert values["notes"][0].startswith(f"the run was cut short, at 0 of 10000 steps: {reason}")
     assert reason in (tmp_path / "run" / "logs" / "train.log").read_text(encoding="utf-8")
