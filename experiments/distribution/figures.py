@@ -5,12 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from experiments.distribution.results import PanelResult, StudyResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _COLOURS = ("#000000", "#4477aa", "#66ccee", "#ee6677", "#aa3377", "#228833", "#ccbb44")
+_ROOM = 1.5
+"""Between what is drawn and the frame, on a logarithmic axis."""
 
 
 def draw_figures(directory: Path, study: StudyResult) -> list[Path]:
@@ -36,6 +40,8 @@ def _draw(directory: Path, panel: PanelResult) -> Path:
 
 
 def _draw_means(axis: Axes, panel: PanelResult) -> None:
+    from matplotlib.ticker import LogFormatter
+
     names = [result.configuration.name for result in panel.measured]
     for row, (result, colour) in enumerate(zip(panel.measured, _COLOURS, strict=False)):
         mean = result.steps_per_goal
@@ -47,18 +53,25 @@ def _draw_means(axis: Axes, panel: PanelResult) -> None:
     axis.set_yticks(range(len(names)), names)
     axis.invert_yaxis()
     axis.set_xscale("log")  # Configurations differ by factors; of an interval that reaches 0 the rest is shown.
-    axis.set_xlim(1, panel.panel.steps)
+    values = [run.steps_per_goal for result in panel.measured for run in result.runs]
+    axis.set_xlim(min(values) / _ROOM, max(values) * _ROOM)
+    axis.xaxis.set_major_formatter(LogFormatter())
+    axis.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))  # Only where they fit.
     axis.set_xlabel("steps per goal over the run (dots: runs)")
     axis.grid(alpha=0.3, axis="x", which="both")
 
 
 def _draw_curves(axis: Axes, panel: PanelResult) -> None:
+    from matplotlib.ticker import LogFormatter
+
     for result, colour in zip(panel.measured, _COLOURS, strict=False):
         mean, low, high = result.curve
         axis.plot(result.at, mean, color=colour, linewidth=1.6, label=result.configuration.name)
         axis.fill_between(result.at, low, high, color=colour, alpha=0.15, linewidth=0)
     axis.set_yscale("log")
-    axis.set_ylim(1, panel.panel.steps)  # What a goal can take; the bands of few runs go beyond.
+    highest = max(float(np.nanmax(result.curve[0])) for result in panel.measured)
+    axis.yaxis.set_major_formatter(LogFormatter())
+    axis.set_ylim(1, highest * _ROOM)  # The bands of few runs go far beyond.
     axis.set_xlim(0, panel.panel.steps)
     axis.set_xlabel("steps of the run, resets included")
     axis.set_ylabel(f"steps per goal in {panel.panel.window} steps, geometric mean")
