@@ -176,9 +176,10 @@ def check_key(key: str, value: object, where: str) -> None:
 def check_together(values: Mapping[str, Any], where: str) -> None:
     """Refuse values of one direction that contradict each other. Each has passed :func:`check_key`."""
     trace: Trace | None = values["trace"]
-    for column in trace.columns if trace else ():
-        if values[column] != DIRECTION_DEFAULTS[column]:
-            raise said_twice(column, values[column], where, f"the trace {trace.name}")  # type: ignore[union-attr]
+    if trace is not None:
+        for column in trace.columns:
+            if values[column] != DIRECTION_DEFAULTS[column]:
+                raise said_twice(column, values[column], where, f"the trace {trace.name}")
     _check_jitter(values, trace, where)
     if values["queue_packets"] and values["rate_mbit"] in (None, math.inf) and not (trace and trace.rate_mbit):
         raise ConfigError(

@@ -14,13 +14,10 @@ from deploy.stop_signals import StopSignals
 from deploy.summary import read_record, summarise
 from experiments import in_process
 from experiments.train import Training, train
+from tests.experiments.small_algorithm import SMALL_ALGORITHM
 
 SMALL = (
-    "algorithm.batch_size=8",
-    "algorithm.hidden_size=32",
-    "algorithm.min_size_to_sample=30",
-    "algorithm.policy_push_interval=5",
-    "algorithm.replay_capacity=500",
+    *SMALL_ALGORITHM,
     "actor.min_inference_s=0.001",
     "learner.min_update_s=0.005",
 )

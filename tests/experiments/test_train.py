@@ -16,14 +16,11 @@ from deploy.console import Console
 from deploy.episodes import EpisodeTable
 from deploy.stop_signals import StopSignals
 from experiments.train import Training, main, train
+from tests.experiments.small_algorithm import SMALL_ALGORITHM
 
 ROOT = Path(__file__).parents[2]
 SMALL = (
-    "algorithm.batch_size=8",
-    "algorithm.hidden_size=32",
-    "algorithm.min_size_to_sample=30",
-    "algorithm.policy_push_interval=5",
-    "algorithm.replay_capacity=500",
+    *SMALL_ALGORITHM,
     "task.target_half_width=0.4",
 )
 

@@ -14,14 +14,11 @@ from deploy.console import Console
 from deploy.episodes import EpisodeTable
 from deploy.summary import read_record, summarise
 from experiments.train import Training, main, train
+from tests.experiments.small_algorithm import SMALL_ALGORITHM
 
 INFERENCE_S, UPDATE_S = 0.001, 0.005
 SMALL = (
-    "algorithm.batch_size=8",
-    "algorithm.hidden_size=32",
-    "algorithm.min_size_to_sample=30",
-    "algorithm.policy_push_interval=5",
-    "algorithm.replay_capacity=500",
+    *SMALL_ALGORITHM,
     "task.target_half_width=0.6",
     f"actor.min_inference_s={INFERENCE_S}",
     f"learner.min_update_s={UPDATE_S}",
