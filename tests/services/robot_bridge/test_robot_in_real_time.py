@@ -1,6 +1,7 @@
 """The bridge and a simulated robot in a thread of its own, by a simulated clock: the world does not pause."""
 
 import numpy as np
+import pytest
 
 from common import topics
 from common.codec import decode
@@ -19,19 +20,22 @@ TURN = np.array([0.1, 0, 0, 0, 0], np.float32)
 
 
 class Run:
-    """A run of the UR5 whose actor always answers the same, but for the cycles in which it is silent."""
+    """A run of a robot whose actor always answers the same, but for the cycles in which it is silent."""
 
-    def __init__(self, directory, steps, silent=(), **task) -> None:
+    def __init__(
+        self, directory, steps, silent=(), name="ur5_visual_reacher_min_time", answer=TURN, where=None, **task
+    ) -> None:
         skip_without_opengl()
         self.clock = SimulatedClock()
         self.network = InMemoryNetwork()
         self.service = SoloService(topics.ROBOT_BRIDGE, self.network, directory, self.clock, incarnation=BRIDGE)
         self.service.peers = {topics.ACTOR: "running", topics.REPLAY: "running"}
         rng = np.random.default_rng(0)
-        self.task = load_task("ur5_visual_reacher_min_time", overrides=task, pacing="realtime", rng=rng)
+        self.task = load_task(name, overrides=task, pacing="realtime", rng=rng)
         settings = RobotBridgeSettings(pacing="realtime", steps=steps, stop_after=0.5)
         self.bridge = RobotBridge(self.service, self.task, settings, Totals())
-        self.actor, self.silent, self.time_steps = Peer(self.network), silent, []
+        self.actor, self.silent, self.answer, self.time_steps = Peer(self.network), silent, answer, []
+        self.where, self.places = where or (lambda robot: None), []
         self.actor.transport.subscribe(topics.TIME_STEP, self._receive)
         self.actor.transport.subscribe(topics.FINISHED, lambda _: self._end())
         try:
@@ -42,8 +46,9 @@ class Run:
     def _receive(self, payload) -> None:
         time_step = decode(payload, TimeStep, self.task.spec.dimensions)
         self.time_steps.append(time_step)
+        self.places.append(self.where(self.task.robot))
         if time_step.step_index not in self.silent and not time_step.is_last:
-            answer = Action(ACTOR, BRIDGE, time_step.seq, TURN, -1.0, 3, 0, 0, 0, 0, -1)
+            answer = Action(ACTOR, BRIDGE, time_step.seq, self.answer, -1.0, 3, 0, 0, 0, 0, -1)
             self.actor.send(topics.ACTION, answer)
 
     def _end(self) -> None:
@@ -68,6 +73,34 @@ def test_without_answers_the_arm_goes_on_at_its_last_speed_until_the_watchdog_st
     np.testing.assert_allclose(speeds[55:], 0.1, atol=1e-6)
     assert run.bridge.counts.overruns == 0
     assert run.bridge.counters()["stops"] == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "answer", "where", "speed"),
+    [
+        ("ur5_visual_reacher", [0.1, 0, 0, 0, 0], lambda robot: robot.arm.angles[0], 0.1),
+        ("franka_visual_reacher", [0.1, 0, 0, 0, 0, 0, 0], lambda robot: robot.arm.angles[0], 0.1),
+        # On the spot, away from whatever wall there is: 2 x 47 mm/s at the ends of a track of 235 mm, and of 48 mm.
+        ("create_reacher", [-47, 47], lambda robot: robot.drive.pose[2], 0.4),
+        ("vector_charger_detector", [-9.6, 9.6], lambda robot: robot.drive.pose[2], 0.4),
+    ],
+    ids=["ur5", "franka", "create", "vector"],
+)
+def test_every_robot_goes_on_without_answers_until_the_watchdog_stops_it(tmp_path, name, answer, where, speed):
+    # The watchdog waits for 0.5 s; the silence, in cycles of 40 to 100 ms, lasts for 1 s and more.
+    run = Run(tmp_path, 50, range(25, 50), name, np.array(answer, np.float32), where)
+    seconds = np.array([(step.published_ns - run.time_steps[0].published_ns) * 1e-9 for step in run.time_steps])
+    silent_from = next(time for time, step in zip(seconds, run.time_steps, strict=True) if step.step_index == 25)
+    since, places = seconds - silent_from, np.array(run.places)
+    goes_on = (since >= 0) & (since <= 0.45)
+    rests = since >= 0.7
+    # What is seen is up to a sensor's period old, 60 ms at most.
+    moved, took = np.ptp(places[goes_on]), np.ptp(since[goes_on])
+    assert moved == pytest.approx(speed * took, abs=speed * 0.07)
+    assert rests.sum() >= 6
+    np.testing.assert_allclose(places[rests], places[-1], atol=1e-9)
+    assert run.bridge.counters()["stops"] == 1
+    assert {step.action_source for step in np.array(run.time_steps)[rests]} == {ActionSource.STOP}
 
 
 def test_each_cycle_brings_the_frames_and_packets_of_its_time(tmp_path):
