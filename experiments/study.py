@@ -40,10 +40,17 @@ class Study(Generic[AJob]):
         self._name, self._jobs, self._settings = name, jobs, settings
         self._cost, self._write_results = cost, write_results
 
-    def run(self, out: Path, workers: int, console: Console, do: Work) -> int:
+    def run(self, out: Path, workers: int, console: Console, do: Work, *, pinned: bool) -> int:
         """Run what is not finished, write the results; return the exit code.
 
         The results of an interrupted study go to :data:`SO_FAR`: what ``out`` has from a whole one stays.
+
+        Args:
+            out: below which all is kept.
+            workers: processes at a time.
+            console: where it is told.
+            do: does a job.
+            pinned: see :class:`WorkerPool`; what a job starts stays on its core too.
         """
         runs, failures = runs_folder(out), dict[Key, str]()
 
@@ -60,7 +67,7 @@ class Study(Generic[AJob]):
             for name in remove_half_finished(runs, self._jobs.values(), record.rows):
                 console.line(f"{name} was interrupted: removed, it begins again")
             console.line(f"{self._finished(record)} of {len(self._jobs)} jobs are finished; results go to {out}")
-            with WorkerPool(do, {**self._settings, "runs": str(runs)}, workers, pinned=True) as pool:
+            with WorkerPool(do, {**self._settings, "runs": str(runs)}, workers, pinned=pinned) as pool:
                 run_grid(
                     record,
                     list(self._jobs),

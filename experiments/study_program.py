@@ -54,8 +54,8 @@ class StudyProgram(Generic[ASize, AJob]):
     """Below it, by the sizes' names, what is not sent elsewhere by ``--out``."""
     plan: Callable[[ASize], StudyPlan[AJob]]
     write_results: WriteResults[ASize]
-    most_workers: Callable[[ASize], int | None] = lambda size: None
-    """Jobs of a size that may be done side by side; None: any number."""
+    real_time: Callable[[ASize], bool] = lambda size: False
+    """Whether a size's jobs go by the clock. Then one is done at a time, on all cores; else each has a core."""
 
     def main(self, arguments: Sequence[str] | None, sizes: Mapping[str, ASize], work: Work) -> int:
         """Run a study from the command line; return the exit code.
@@ -73,8 +73,9 @@ class StudyProgram(Generic[ASize, AJob]):
 
         def run() -> int:
             workers = check_count("--workers", options.workers, MOST_WORKERS)
-            if (most := self.most_workers(size)) is not None:
-                workers = min(workers, most)
+            real_time = self.real_time(size)
+            if real_time:
+                workers = 1
             plan = self.plan(size)
             if options.plan:
                 console.line(plan.text(workers))
@@ -88,7 +89,7 @@ class StudyProgram(Generic[ASize, AJob]):
             )
             if folder != (self.results / options.size).absolute():  # there, published results are to be replaced
                 refuse_foreign(folder)
-            return study.run(folder, workers, console, work)
+            return study.run(folder, workers, console, work, pinned=not real_time)
 
         return exit_code(self.name, "--out", out, console, run)
 

@@ -47,7 +47,7 @@ PROGRAM = StudyProgram(
     Path(__file__).parent / "results",
     Plan,
     write_results,
-    most_workers=lambda size: size.most_workers,
+    real_time=lambda size: size.real_time,
 )
 
 

@@ -69,9 +69,9 @@ class Size:
         )
 
     @property
-    def most_workers(self) -> int | None:
-        """Runs that may go on side by side; None: any number. In real time they would hold each other up."""
-        return 1 if any(panel.real_time for panel in self.panels) else None
+    def real_time(self) -> bool:
+        """Whether a run needs the computer for itself: side by side, or on one core, runs would hold each other up."""
+        return any(panel.real_time for panel in self.panels)
 
     def expected_s(self, job: Job) -> float:
         """Seconds that a job takes one core, roughly."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from experiments.distribution.configurations import SAC
 from experiments.distribution.jobs import Job, work
 from experiments.distribution.sizes import Panel, Size
+from tests.experiments.fake_jobs import cores
 
 SMALL_NETWORKS = (
     "algorithm.batch_size=8",
@@ -41,6 +42,11 @@ def hand_made(settings, key):
         "updates": job.steps,
         "core_s": 0.5,
     }
+
+
+def hand_made_with_cores(settings, key):
+    """The same, and on which cores."""
+    return hand_made(settings, key) | cores(settings, key)
 
 
 def half_run(settings, job):

@@ -1,16 +1,20 @@
 """Runs of the study through the launcher."""
 
+import json
+import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from experiments.distribution.__main__ import main
 from experiments.distribution.configurations import SAC
 from experiments.distribution.jobs import work
 from experiments.distribution.plan import Plan
 from experiments.distribution.real_time import LaunchError, command_line, launch
-from experiments.distribution.sizes import REAL, Panel, Size
+from experiments.distribution.sizes import SIZES, Panel, Size
 from experiments.training import Training
-from tests.experiments.distribution.studies_by_hand import SMALL_NETWORKS
+from tests.experiments.distribution.studies_by_hand import HAND_MADE, SMALL_NETWORKS, hand_made_with_cores
 
 BY_NAME = {configuration.name: configuration for configuration in SAC}
 
@@ -58,5 +62,20 @@ def test_the_launcher_is_told_all_that_the_training_says():
     )
 
 
-def test_runs_in_real_time_are_not_done_side_by_side():
-    assert REAL.most_workers == 1
+@pytest.mark.parametrize("real_time", [False, True])
+def test_a_run_in_real_time_has_all_cores_and_one_in_virtual_time_a_core_of_its_own(tmp_path, real_time):
+    every_core = sorted(os.sched_getaffinity(0))
+    size = replace(HAND_MADE, panels=tuple(replace(panel, real_time=real_time) for panel in HAND_MADE.panels))
+    assert main(["--out", str(tmp_path), "--workers", "2"], {size.name: size}, hand_made_with_cores) == 0
+    lines = (tmp_path / "runs" / "results.jsonl").read_text(encoding="utf-8").splitlines()
+    rows = [json.loads(line) for line in lines]
+    assert len(rows) == len(size.jobs()) == 6
+    if real_time:
+        assert {row["process"] for row in rows} == {rows[0]["process"]}, "one at a time"
+        assert all(row["cores"] == every_core for row in rows)
+    elif len(every_core) > 1:
+        assert all(row["cores"] in ([core] for core in every_core[:2]) for row in rows)
+
+
+def test_the_size_of_real_runs_is_in_real_time_and_no_other_is():
+    assert [name for name, size in SIZES.items() if size.real_time] == ["real"]
