@@ -21,6 +21,9 @@ from common.errors import ConfigError
 Config = TypeVar("Config")
 Tables = dict[str, dict[str, Any]]
 
+_LARGEST_WHOLE = 2**63 - 1
+"""Larger ones fit neither messages nor arrays."""
+
 
 def setting(
     default: Any = MISSING,
@@ -135,6 +138,8 @@ def build_section(cls: type[Config], values: Any, where: str) -> Config:
 
 def _checked(hint: Any, value: Any, item: dataclasses.Field[Any], where: str) -> Any:
     kind = get_origin(hint) or hint
+    if isinstance(value, int) and abs(value) > _LARGEST_WHOLE:
+        raise ConfigError(f"{where} = {value}: expected a number of at most 64 bits")
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     wrong_bool = isinstance(value, bool) and kind is not bool

@@ -18,6 +18,8 @@ from services.robot_bridge.bookkeeping import CycleCounts, Ledger
 from services.robot_bridge.config import RobotBridgeSettings
 from services.robot_bridge.tasks.base import SensorReading
 
+_LARGEST_REWARD = float(np.finfo(np.float32).max)
+
 
 @dataclass(frozen=True)
 class CommandInForce:
@@ -83,8 +85,10 @@ class TimeStepStream:
             ServiceError: a sensor or the reward is not finite or not of the TaskSpec's shape; nothing was published.
         """
         published_ns = self._service.clock.now_ns()
-        if not (np.isfinite(reading.proprioception).all() and np.isfinite(reward)):
-            raise ServiceError(f"a sensor gave {reading.proprioception}, reward {reward}: expected finite numbers")
+        # A reward travels in 64 bits, but replay keeps 32 of it.
+        if not (np.isfinite(reading.proprioception).all() and abs(reward) <= _LARGEST_REWARD):
+            given = f"a sensor gave {reading.proprioception}, reward {reward}"
+            raise ServiceError(f"{given}: expected finite 32-bit numbers")
         self._check_shapes(reading)
         # Here, in the cycle: the observation waits for it either way, and a thread of its own would add a hand-over.
         frames = encode_frames(reading.frames, self._encoding)

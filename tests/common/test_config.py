@@ -96,6 +96,7 @@ def test_the_ends_of_a_range_belong_to_it(tmp_path):
         ("joints = 0", "[arm] joints = 0: expected a value from 1 to 7"),
         ("joints = 8", "[arm] joints = 8: expected a value from 1 to 7"),
         ("joints = 6.0", "[arm] joints = 6.0: expected a whole number"),
+        (f"joints = {2**63}", f"[arm] joints = {2**63}: expected a number of at most 64 bits"),
         ('joints = "6"', "[arm] joints = '6': expected a whole number"),
         ("joints = true", "[arm] joints = True: expected a whole number"),
         ("joints = [6]", "[arm] joints = [6]: expected a whole number"),

@@ -109,9 +109,9 @@ class DenseSettings(Ur5Settings):
     """Action cycles that a reset takes: the thesis counts them in minimum-time tasks only."""
     max_speed: float = setting(0.7, low=0.01, high=3.14)
     """rad/s, the bound of the actions."""
-    target_weight: float = setting(800.0, low=0.0)
+    target_weight: float = setting(800.0, low=0.0, high=1e6)
     """alpha of the reward."""
-    posture_weight: float = setting(1.0, low=0.0)
+    posture_weight: float = setting(1.0, low=0.0, high=1e6)
     """beta of the reward."""
 
 

@@ -1,5 +1,8 @@
 """What keeps the robot from harm: watchdog, emergency stop, pause, refused messages, sensors that fail."""
 
+import math
+import re
+
 import numpy as np
 import pytest
 
@@ -191,11 +194,11 @@ def test_a_flood_of_actions_keeps_the_newest(tmp_path):
     assert sources(scene) == [POLICY]
 
 
-@pytest.mark.parametrize("field", ["offset", "reward"])
-def test_a_sensor_that_gives_no_number_ends_the_service_and_stops_the_robot(tmp_path, field):
+@pytest.mark.parametrize(("field", "value"), [("offset", math.nan), ("reward", math.nan), ("reward", -1e39)])
+def test_a_sensor_that_gives_no_number_ends_the_service_and_stops_the_robot(tmp_path, field, value):
     scene = Scene(tmp_path, answers=0.01, steps=10)
-    scene.task.on_outcome = {3: lambda: setattr(scene.task, field, float("nan"))}
-    with pytest.raises(ServiceError, match=r"nan.*expected finite numbers"):
+    scene.task.on_outcome = {3: lambda: setattr(scene.task, field, value)}
+    with pytest.raises(ServiceError, match=rf"{re.escape(str(value))}.*expected finite 32-bit numbers"):
         scene.run()
     assert scene.task.log[-1][0] == "close"
     assert len(scene.time_steps) == 4  # what cannot be trusted is not published
