@@ -82,6 +82,8 @@ class SimulatedCamera(Camera):
         self._ready.clear()
         self._rng = rng
         self._light_phase = rng.uniform(0.0, 2 * math.pi)
+        self._light_began_ns: int | None = None
+        """When the first frame since then was captured: an attempt's light must not depend on when it begins."""
 
     def capture(self, data: mujoco.MjData, capture_ns: int, *, at_once: bool = False) -> None:
         """Take a picture of the present state.
@@ -170,7 +172,10 @@ class SimulatedCamera(Camera):
 
     def _set_lights(self, now_ns: int) -> np.float64:
         change = self._defects.lighting_change
-        angle = 2 * math.pi * (now_ns % LIGHT_PERIOD_NS) / LIGHT_PERIOD_NS + self._light_phase
+        if self._light_began_ns is None:
+            self._light_began_ns = now_ns
+        passed_ns = (now_ns - self._light_began_ns) % LIGHT_PERIOD_NS
+        angle = 2 * math.pi * passed_ns / LIGHT_PERIOD_NS + self._light_phase
         brightness = np.float64(1.0 + change * math.sin(angle))
         if change:
             for light, undisturbed in self._lights:

@@ -16,14 +16,21 @@ from gymnasium.utils.env_checker import check_env
 
 from common.errors import ConfigError, RelodError
 from services.robot_bridge import gymnasium_env
+from services.robot_bridge.class_table import load_class
 from services.robot_bridge.gymnasium_env import TaskEnv
 from services.robot_bridge.gymnasium_ids import tasks_by_id
-from services.robot_bridge.tasks import load_task
+from services.robot_bridge.tasks import TASKS, Task, load_task
 from tests.helpers import TIMEOUT_S
 from tests.services.builders import EventClock
+from tests.services.robot_bridge.opengl import skip_without_opengl
 from tests.services.robot_bridge.scripted import ScriptedTask
 
 CENTRE = np.zeros(2, np.float32)
+DISTURBED = sorted(
+    identifier
+    for identifier, name in tasks_by_id().items()
+    if "disturbed" in load_class(Task, name, TASKS, "task").PRESETS
+)
 
 
 @functools.cache
@@ -151,6 +158,16 @@ def test_a_seed_determines_everything_whatever_was_before(identifier):
     first = record(fresh, seed=5)
     assert same(first, record(used, seed=5))
     assert not same(first, record(used, seed=6))
+
+
+@pytest.mark.parametrize("identifier", DISTURBED)
+def test_a_seed_determines_also_what_disturbs_a_robot(identifier):
+    skip_without_opengl()
+    fresh, used = make(identifier, preset="disturbed", time_limit=7), make(identifier, preset="disturbed", time_limit=7)
+    record(used, seed=3, count=11)
+    first = record(fresh, seed=5, count=20)
+    assert same(first, record(fresh, seed=5, count=20))
+    assert same(first, record(used, seed=5, count=20))
 
 
 def test_the_interface_adds_nothing_to_the_task():

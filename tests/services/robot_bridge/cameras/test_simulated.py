@@ -111,6 +111,16 @@ def test_changing_light_goes_up_and_down_by_the_share_and_comes_back():
     assert scene.shot(LIGHT_PERIOD_NS).astype(float).mean() / undisturbed == pytest.approx(shares[0])
 
 
+def test_changing_light_follows_from_the_seed_whenever_it_begins():
+    scene = Scene(lighting_change=0.5)
+    shares = []
+    for seed, begun_ns in ((3, 0), (3, 7 * LIGHT_PERIOD_NS // 3), (4, 0)):
+        scene.camera.begin(np.random.default_rng(seed))
+        shares.append([scene.shot(begun_ns + k * LIGHT_PERIOD_NS // 10).mean() for k in range(10)])
+    assert shares[0] == shares[1]
+    assert shares[0] != shares[2]
+
+
 def test_what_shines_by_itself_stays_visible_when_the_room_gets_dark():
     scene = Scene(lighting_change=0.9)
     scene.model.geom("wall").matid = scene.model.material("shining").id
