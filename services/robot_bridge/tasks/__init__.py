@@ -71,5 +71,9 @@ def load_task(
     if preset not in task_class.PRESETS:
         raise ConfigError(f"[task] preset = {preset!r}: task {name} has the presets {', '.join(task_class.PRESETS)}")
     values = {**task_class.PRESETS[preset], **(overrides or {})}
-    settings: Any = build_section(task_class.SETTINGS, values, f"[task] {name}")
-    return task_class(settings, name=name, preset=preset, pacing=pacing, rng=rng)
+    where = f"[task] {name}"
+    settings: Any = build_section(task_class.SETTINGS, values, where)
+    try:
+        return task_class(settings, name=name, preset=preset, pacing=pacing, rng=rng)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error

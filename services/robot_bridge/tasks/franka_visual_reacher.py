@@ -24,6 +24,7 @@ from services.robot_bridge.robots.sensed_world import Rates
 from services.robot_bridge.target_detection import TARGET_COLOURS, colour_mask, share
 from services.robot_bridge.tasks.base import Outcome
 from services.robot_bridge.tasks.robot_task import DISTURBED, RobotSettings, RobotTask, View
+from services.robot_bridge.tasks.setting_checks import expect_angles, expect_numbers
 
 TARGET = TARGET_COLOURS["franka"]
 ANGLE_MARGIN = 0.05
@@ -65,6 +66,8 @@ class FrankaSettings(RobotSettings):
 
     def __post_init__(self) -> None:
         _expect_range("posture", self.posture_low, self.posture_high, JOINTS)
+        expect_angles("posture_low", self.posture_low, ANGLE_LOW, ANGLE_HIGH)
+        expect_angles("posture_high", self.posture_high, ANGLE_LOW, ANGLE_HIGH)
         _expect_range("box", self.box_low, self.box_high, 3)
         _expect_range("bag", self.bag_low, self.bag_high, 2)
         if not (np.array(self.box_low) < self.box_high).all():
@@ -125,7 +128,6 @@ class FrankaVisualReacher(RobotTask):
 
 def _expect_range(name: str, low: Sequence[float], high: Sequence[float], count: int) -> None:
     for end, values in (("low", low), ("high", high)):
-        if len(values) != count or not np.isfinite(values).all():
-            raise ConfigError(f"{name}_{end} = {list(values)}: expected {count} finite numbers")
+        expect_numbers(f"{name}_{end}", values, count)
     if not (np.array(low) <= high).all():
         raise ConfigError(f"{name}_low = {list(low)}: expected at most {name}_high = {list(high)} in each axis")

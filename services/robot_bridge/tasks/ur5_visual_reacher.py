@@ -8,7 +8,6 @@ that the tool stays in are chosen such that the untrained policy reaches the tar
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -19,7 +18,15 @@ from common.errors import ConfigError
 from common.messages import Float32Array, UInt8Array
 from services.robot_bridge.robots.base import SimulatedRobot
 from services.robot_bridge.robots.sensed_world import Rates
-from services.robot_bridge.robots.ur5 import ANGLE_HIGH, ANGLE_LOW, COMMANDED_JOINTS, CONTROL_PERIOD_NS, Ur5, ur5_limits
+from services.robot_bridge.robots.ur5 import (
+    ANGLE_HIGH,
+    ANGLE_LOW,
+    COMMANDED_JOINTS,
+    CONTROL_PERIOD_NS,
+    MECHANICAL_ANGLE,
+    Ur5,
+    ur5_limits,
+)
 from services.robot_bridge.robots.ur5_scene import JOINTS, WRIST_CAMERA, Monitor, Ur5Scene
 from services.robot_bridge.target_detection import (
     TARGET_COLOURS,
@@ -31,10 +38,14 @@ from services.robot_bridge.target_detection import (
 )
 from services.robot_bridge.tasks.base import Outcome
 from services.robot_bridge.tasks.robot_task import DISTURBED, RobotSettings, RobotTask, View
+from services.robot_bridge.tasks.setting_checks import expect_angles, expect_numbers
 
 TARGET = TARGET_COLOURS["ur5"]
 ANGLE_MARGIN = 0.35
 """rad, by which a joint is expected to overshoot its limits while it brakes."""
+POSTURE_LOW = np.append(ANGLE_LOW, -MECHANICAL_ANGLE[COMMANDED_JOINTS:])
+POSTURE_HIGH = np.append(ANGLE_HIGH, MECHANICAL_ANGLE[COMMANDED_JOINTS:])
+"""rad, of the six joints: beyond its range a commanded one turns back instead of obeying."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +78,10 @@ class Ur5Settings(RobotSettings):
     """Degrees, from the camera's picture's top to its bottom."""
 
     def __post_init__(self) -> None:
-        _expect_numbers("posture", self.posture, JOINTS)
+        expect_numbers("posture", self.posture, JOINTS)
+        expect_angles("posture", self.posture, POSTURE_LOW, POSTURE_HIGH)
         for name in ("box_low", "box_high"):
-            _expect_numbers(name, getattr(self, name), 3)
+            expect_numbers(name, getattr(self, name), 3)
         if not (np.array(self.box_low) < self.box_high).all():
             raise ConfigError(f"box_low = {self.box_low}: expected less than box_high = {self.box_high} in each axis")
         if not (self.monitor().target_range() >= 0).all():
@@ -197,8 +209,3 @@ def dense_reward(
     """
     twisted = abs(math.pi - float(angles[:3].sum())) + abs(float(angles[3:].sum()))
     return target_weight * weighted_share(mask, weights) - posture_weight * twisted
-
-
-def _expect_numbers(name: str, values: Sequence[float], count: int) -> None:
-    if len(values) != count or not np.isfinite(values).all():
-        raise ConfigError(f"{name} = {list(values)}: expected {count} finite numbers")

@@ -83,10 +83,19 @@ def test_the_task_is_that_of_the_thesis():
         ({"bag_low": [0.9, 0.0]}, r"bag_low = \[0.9, 0.0\]: expected at most bag_high = .* in each axis"),
         ({"box_high": [0.7, 0.3]}, "box_high = .*: expected 3 finite numbers"),
         ({"box_low": [0.7, -0.3, 0.08]}, r"box_low = .*: expected less than box_high = .* in each axis"),
-        # Elbow and wrist at -90 and 90 degrees: by hand at (.5545, 0, .6245), see the scene's tests.
         (
-            {name: [0.0, 0.0, 0.0, -math.pi / 2, 0.0, math.pi / 2, 0.0] for name in ("posture_low", "posture_high")},
-            r"posture_low = .* holds the flange at \[0.55., -?0.0, 0.62.\], expected a place between box_low = .*",
+            {name: [*BELOW["posture_low"][:6], 10.0] for name in ("posture_low", "posture_high")},
+            r"posture_low = .*: expected joint 7 from -0.9 to 0.9 rad, got 10.0",
+        ),
+        (
+            {"posture_high": [0.2, 0.13, 0.02, -2.0, 0.03, 3.0, 0.8]},
+            r"posture_high = .*: expected joint 6 from 1.7 to 2.96 rad, got 3.0",
+        ),
+        # Elbow at -90 and wrist at 135 degrees. By hand: .0825 + .384 + (.088 + .107) / 2^.5 forward,
+        # .333 + .316 + .0825 + (.088 - .107) / 2^.5 up.
+        (
+            {name: [0.0, 0.0, 0.0, -math.pi / 2, 0.0, 3 * math.pi / 4, 0.0] for name in BELOW if "posture" in name},
+            rf"^\[task\] {NAME}: posture_low = .* holds the flange at \[0.604, -?0.0, 0.718\], expected a place",
         ),
         ({"bag_radius": 0.0}, "bag_radius = 0.0: expected"),
         ({"max_speed": 3.0}, "max_speed = 3.0: expected"),

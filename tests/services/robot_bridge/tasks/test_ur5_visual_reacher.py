@@ -80,7 +80,16 @@ def test_the_tasks_are_those_of_the_thesis(name, speed, limit, reset, has_goal):
             "target_radius = 0.2, target_margin = 0.1: expected at most 0.28",
         ),
         ({"monitor_distance": 0.5}, "monitor_distance = 0.5: expected"),
-        ({"posture": [0.0] * 6}, r"posture = .* holds the tool at \[0.817, 0.191, -0.005\], expected a place between"),
+        (
+            {"posture": [7.853885, *POSTURE[1:]]},
+            r"posture = \[7.85.*\]: expected joint 1 from 0.8727 to 2.443 rad, got 7.853885",
+        ),
+        ({"posture": [*POSTURE[:5], 6.5]}, r"posture = .*: expected joint 6 from -6.283 to 6.283 rad, got 6.5"),
+        # Upright. By hand: the links' d .10915 to the side and .09465 back, .089159 + .425 + .39225 + .0823 up.
+        (
+            {"posture": [math.pi / 2, -math.pi / 2, 0.0, -math.pi, -math.pi / 2, 0.0]},
+            rf"^\[task\] {MIN_TIME}: posture = .* holds the tool at \[-0.109, -0.095, 0.989\], expected a place",
+        ),
         ({"max_speed": 0.0}, "max_speed = 0.0: expected"),
         ({"camera_latency": -0.1}, "camera_latency = -0.1: expected"),
     ],
