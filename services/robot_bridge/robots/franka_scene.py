@@ -14,6 +14,7 @@ from services.robot_bridge.mujoco_without_opengl import mujoco
 from services.robot_bridge.robots.base import ROOM_CAMERA
 from services.robot_bridge.robots.table_room import (
     MATERIALS,
+    TABLE_HALF_WIDTH,
     VISUALS,
     Point,
     Shape,
@@ -41,13 +42,17 @@ TOOL_TURN = -math.pi / 4
 """rad, about the flange's axis: so is the manufacturer's hand mounted, and here the webcam in place of it."""
 CAMERA_PLACE: Point = (0.05, 0.0, 0.02)
 """m, of the webcam in the tool's frame: x away from the arm in the start postures, z where the tool points."""
+TABLE_X = 0.35
+"""m, of the table's middle."""
+FOOT_RADIUS = 0.078
+"""m."""
 
 _FOOT_ROUND: tuple[Shape, ...] = (
     ("white", 0.062, (0, 0, 0.062), (0, 0, 0.080)),
     ("white", 0.052, (-0.09, 0, 0.052), (0, 0, 0.060)),
 )
 _FOOT_FLAT: tuple[Shape, ...] = (
-    ("dark", 0.078, (0, 0, 0), (0, 0, 0.012)),
+    ("dark", FOOT_RADIUS, (0, 0, 0), (0, 0, 0.012)),
     ("white", 0.062, (0, 0, 0.080), (0, 0, 0.141)),
 )
 # For each link, shapes in the frame of its joint, whose axis is z: round ones, and flat ones that cap them.
@@ -92,6 +97,11 @@ class BeanBag:
     height: float
     """m, of its top above the table."""
 
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lowest and highest (2,) m, x and y of its middle: it lies on the table, before the arm's foot."""
+        free = TABLE_HALF_WIDTH - self.radius
+        return np.array([FOOT_RADIUS + self.radius, -free]), np.array([TABLE_X + free, free])
+
 
 class FrankaScene:
     """The model and its state."""
@@ -130,7 +140,7 @@ def scene_xml(bag: BeanBag, field_of_view: float) -> str:
   <worldbody>
     <light directional="true" pos="1.66 -.98 3" dir="-.45 .35 -1" diffuse=".42 .42 .40" specular=".2 .2 .2"/>
     <camera name="{ROOM_CAMERA}" pos="1.65 -1.15 .95" xyaxes=".657 .754 0 -.270 .235 .934" fovy="36"/>
-    {table_xml(0.35, 0)}
+    {table_xml(TABLE_X, 0)}
     <geom name="wall" type="box" size="4 .02 1.6" pos="0 2.2 .86" material="wall"/>
     <geom name="side wall" type="box" size=".02 4 1.6" pos="-2.2 0 .86" material="wall"/>
     <geom name="bag" type="ellipsoid" size="{bag.radius} {bag.radius} {half_height}" pos=".6 0 {half_height / 2}"

@@ -32,9 +32,11 @@ MATERIALS = """
     <material name="dark" rgba=".16 .17 .18 1" specular=".2"/>
     <material name="black" rgba=".05 .05 .06 1" specular="0"/>
 """
+TABLE_HALF_WIDTH = 0.75
+"""m."""
 
 
-def table_xml(x: float, y: float, half_width: float = 0.75) -> str:
+def table_xml(x: float, y: float, half_width: float = TABLE_HALF_WIDTH) -> str:
     """Return a floor and a square table on it, its top at height 0 and its middle at (x, y), metres."""
     legs = "\n".join(
         f'<geom type="box" size=".03 .03 .35" pos="{x + across} {y + along} -.39" material="leg"/>'

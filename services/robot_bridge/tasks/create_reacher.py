@@ -54,7 +54,7 @@ class CreateSettings(WheeledSettings):
     """m, of a paper's middle above the floor."""
     camera_height: float = setting(0.28, low=0.1, high=2.0)
     """m, of the webcam above the floor."""
-    threshold: float = setting(0.12, low=0.0, high=1.0)
+    threshold: float = setting(0.12, low=0.0, high=0.99)
     """The goal is reached where more than this share of the image is of the papers' colour."""
 
     def __post_init__(self) -> None:

@@ -24,11 +24,14 @@ from services.robot_bridge.robots.sensed_world import Rates
 from services.robot_bridge.target_detection import TARGET_COLOURS, colour_mask, share
 from services.robot_bridge.tasks.base import Outcome
 from services.robot_bridge.tasks.robot_task import DISTURBED, RobotSettings, RobotTask, View
-from services.robot_bridge.tasks.setting_checks import expect_angles, expect_numbers
+from services.robot_bridge.tasks.setting_checks import expect_angles, expect_numbers, expect_place
 
 TARGET = TARGET_COLOURS["franka"]
 ANGLE_MARGIN = 0.05
 """rad, by which a joint is expected to overshoot its limits while it brakes."""
+
+BOX_LOWEST, BOX_HIGHEST = (-2.0, -2.0, 0.04), (2.0, 2.0, 2.0)
+"""m, of the box's sides: twice as far as the arm reaches; the webcam, .02 m below the flange, has room to brake."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class FrankaSettings(RobotSettings):
     """m, of its top above the table."""
     field_of_view: float = setting(43.3, low=10.0, high=120.0)
     """Degrees, from the camera's picture's top to its bottom."""
-    threshold: float = setting(0.12, low=0.0, high=1.0)
+    threshold: float = setting(0.12, low=0.0, high=0.99)
     """The goal is reached where more than this share of the image is of the bag's colour."""
 
     def __post_init__(self) -> None:
@@ -72,6 +75,14 @@ class FrankaSettings(RobotSettings):
         _expect_range("bag", self.bag_low, self.bag_high, 2)
         if not (np.array(self.box_low) < self.box_high).all():
             raise ConfigError(f"box_low = {self.box_low}: expected less than box_high = {self.box_high} in each axis")
+        for end in ("low", "high"):
+            expect_place(f"box_{end}", getattr(self, f"box_{end}"), BOX_LOWEST, BOX_HIGHEST, "above the table")
+            lowest, highest = self.bag().places()
+            expect_place(f"bag_{end}", getattr(self, f"bag_{end}"), lowest, highest, "on the table before the arm")
+
+    def bag(self) -> BeanBag:
+        """Return the bag that these settings describe."""
+        return BeanBag(self.bag_radius, self.bag_height)
 
 
 class FrankaVisualReacher(RobotTask):
@@ -92,7 +103,7 @@ class FrankaVisualReacher(RobotTask):
 
     def _build_robot(self) -> SimulatedRobot:
         settings = self._settings
-        scene = FrankaScene(BeanBag(settings.bag_radius, settings.bag_height), settings.field_of_view)
+        scene = FrankaScene(settings.bag(), settings.field_of_view)
         limits = franka_limits(settings.acceleration, np.array(settings.box_low), np.array(settings.box_high))
         robot = Franka(scene, limits, settings.max_speed)
         for posture in itertools.product(*zip(settings.posture_low, settings.posture_high, strict=True)):

@@ -27,7 +27,7 @@ from services.robot_bridge.robots.ur5 import (
     Ur5,
     ur5_limits,
 )
-from services.robot_bridge.robots.ur5_scene import JOINTS, WRIST_CAMERA, Monitor, Ur5Scene
+from services.robot_bridge.robots.ur5_scene import CAMERA_OFFSET, JOINTS, WRIST_CAMERA, Monitor, Ur5Scene
 from services.robot_bridge.target_detection import (
     TARGET_COLOURS,
     Mask,
@@ -38,11 +38,15 @@ from services.robot_bridge.target_detection import (
 )
 from services.robot_bridge.tasks.base import Outcome
 from services.robot_bridge.tasks.robot_task import DISTURBED, RobotSettings, RobotTask, View
-from services.robot_bridge.tasks.setting_checks import expect_angles, expect_numbers
+from services.robot_bridge.tasks.setting_checks import expect_angles, expect_numbers, expect_place
 
 TARGET = TARGET_COLOURS["ur5"]
 ANGLE_MARGIN = 0.35
 """rad, by which a joint is expected to overshoot its limits while it brakes."""
+BRAKING_DISTANCE = 0.06
+"""m: about so far does the tool come out of its box towards the monitor before it is driven back."""
+FARTHEST = 2.0
+"""m, of the box's sides: twice as far as the arm reaches."""
 POSTURE_LOW = np.append(ANGLE_LOW, -MECHANICAL_ANGLE[COMMANDED_JOINTS:])
 POSTURE_HIGH = np.append(ANGLE_HIGH, MECHANICAL_ANGLE[COMMANDED_JOINTS:])
 """rad, of the six joints: beyond its range a commanded one turns back instead of obeying."""
@@ -80,8 +84,11 @@ class Ur5Settings(RobotSettings):
     def __post_init__(self) -> None:
         expect_numbers("posture", self.posture, JOINTS)
         expect_angles("posture", self.posture, POSTURE_LOW, POSTURE_HIGH)
+        nearest = self.monitor_distance - CAMERA_OFFSET - BRAKING_DISTANCE
+        where = f"above the table and well before the monitor at monitor_distance = {self.monitor_distance}"
         for name in ("box_low", "box_high"):
             expect_numbers(name, getattr(self, name), 3)
+            expect_place(name, getattr(self, name), (-FARTHEST, -FARTHEST, 0), (FARTHEST, nearest, FARTHEST), where)
         if not (np.array(self.box_low) < self.box_high).all():
             raise ConfigError(f"box_low = {self.box_low}: expected less than box_high = {self.box_high} in each axis")
         if not (self.monitor().target_range() >= 0).all():
@@ -107,7 +114,7 @@ class Ur5Settings(RobotSettings):
 class MinTimeSettings(Ur5Settings):
     """Keys of ``[task]`` of the minimum-time task."""
 
-    threshold: float = setting(0.015, low=0.0, high=1.0)
+    threshold: float = setting(0.015, low=0.0, high=0.99)
     """The goal is reached where more than this share of the image is of the target's colour."""
 
 

@@ -45,6 +45,7 @@ def test_the_task_is_that_of_the_thesis():
         ({"paper_height": 0.1}, "paper_size = 0.3, paper_height = 0.1: expected papers that fit"),
         ({"paper_size": 1.0}, "paper_size = 1.0, paper_height = 0.28: expected papers that fit"),
         ({"max_speed": 0.0}, "max_speed = 0.0: expected"),
+        ({"threshold": 1.0}, "threshold = 1.0: expected a value from 0.0 to 0.99"),
         ({"battery_threshold": 1.5}, "battery_threshold = 1.5: expected"),
         ({"field_of_view": math.nan}, "field_of_view = nan: expected a finite number"),
     ],

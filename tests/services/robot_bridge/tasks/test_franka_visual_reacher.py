@@ -97,6 +97,13 @@ def test_the_task_is_that_of_the_thesis():
             {name: [0.0, 0.0, 0.0, -math.pi / 2, 0.0, 3 * math.pi / 4, 0.0] for name in BELOW if "posture" in name},
             rf"^\[task\] {NAME}: posture_low = .* holds the flange at \[0.604, -?0.0, 0.718\], expected a place",
         ),
+        ({"box_low": [0.3, -0.3, -1.0]}, "box_low = .*: expected z from 0.04 to 2 m, above the table, got -1.0"),
+        ({"box_high": [1e308, 0.3, 0.4]}, r"box_high = .*: expected x from -2 to 2 m, .*, got 1e\+308"),
+        # By hand: the foot's .078 and the bag's .05; the table's .35 + .75 - .05, and .75 - .05 to each side.
+        ({"bag_low": [0.1, 0.0]}, "bag_low = .*: expected x from 0.128 to 1.05 m, on the table before the arm"),
+        ({"bag_high": [3.0, 0.1]}, "bag_high = .*: expected x from 0.128 to 1.05 m, .*, got 3.0"),
+        ({"bag_high": [0.65, 0.8]}, "bag_high = .*: expected y from -0.7 to 0.7 m, .*, got 0.8"),
+        ({"threshold": 1.0}, "threshold = 1.0: expected a value from 0.0 to 0.99"),
         ({"bag_radius": 0.0}, "bag_radius = 0.0: expected"),
         ({"max_speed": 3.0}, "max_speed = 3.0: expected"),
         ({"threshold": 1.5}, "threshold = 1.5: expected"),
@@ -163,7 +170,9 @@ def test_a_bag_further_away_is_higher_in_the_picture_and_one_to_the_left_further
 
 
 def test_nothing_but_the_bag_has_its_colour():
-    task = begun(bag_low=[-3.0, 0.0], bag_high=[-3.0, 0.0])  # behind the wall
+    task = begun()
+    task._draw_goal = lambda: np.array([-3.0, 0.0])  # behind the wall
+    task.begin_episode()
     rng = np.random.default_rng(0)
     for cycle in range(1, 100):
         if cycle % 5 == 1:
@@ -223,7 +232,7 @@ def test_the_flange_is_kept_near_its_box_and_the_webcam_above_the_table_whatever
 
 
 def test_a_joint_at_its_limit_turns_back():
-    task = begun(box_low=[-2.0] * 3, box_high=[2.0] * 3)
+    task = begun(box_low=[-2.0, -2.0, 0.04], box_high=[2.0] * 3)
     highest = 0.0
     for _ in range(150):
         task.command(np.array([0, 0, 0, 0, 1.0, 0, 0], np.float32))

@@ -75,6 +75,14 @@ def test_the_tasks_are_those_of_the_thesis(name, speed, limit, reset, has_goal):
         ({"posture": [math.nan] * 6}, "posture = .*: expected 6 finite numbers"),
         ({"box_low": [0.0, 0.0]}, "box_low = .*: expected 3 finite numbers"),
         ({"box_low": [0.2, 0.2, 0.4]}, r"box_low = .*: expected less than box_high = .* in each axis"),
+        ({"box_high": [1e308, 0.5, 0.63]}, r"box_high = .*: expected x from -2 to 2 m, .*, got 1e\+308"),
+        ({"box_low": [-0.25, 0.17, -0.1]}, "box_low = .*: expected z from 0 to 2 m, above the table .*, got -0.1"),
+        # By hand: .6, less the webcam's .03 before the tool and .06 to brake.
+        (
+            {"box_high": [0.15, 0.52, 0.63], "monitor_distance": 0.6},
+            r"box_high = .*: expected y from -2 to 0.51 m, .* before the monitor at monitor_distance = 0.6, got 0.52",
+        ),
+        ({"threshold": 1.0}, "threshold = 1.0: expected a value from 0.0 to 0.99"),
         (
             {"target_radius": 0.2, "target_margin": 0.1},
             "target_radius = 0.2, target_margin = 0.1: expected at most 0.28",
@@ -196,7 +204,7 @@ def test_the_goal_is_reached_where_more_than_the_threshold_is_red():
 
 
 def test_the_arm_reaches_the_goal_when_it_is_driven_there():
-    task = begun(box_low=[-1.0, 0.0, 0.0], box_high=[1.0, 1.0, 1.0])
+    task = begun(box_low=[-1.0, 0.0, 0.0], box_high=[1.0, 0.69, 1.0])
     show_target(task, 0.059, 0.0)  # straight ahead of the tool
     reached = False
     for cycle in range(1, 100):
