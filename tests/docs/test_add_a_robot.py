@@ -102,6 +102,30 @@ def test_what_the_camera_shows_leads_the_cart_to_its_goal(my_robots, seed):
     task.close()
 
 
+@pytest.mark.parametrize(
+    ("right", "wrong", "match"),
+    [
+        (
+            "return np.array([self.data.qpos[0], 0.0 if",
+            "return np.array([self.data.qpos[0], 0.0, 0.0 if",
+            r"^\[task\] toy: Cart.sense\(\) gives shape \(3,\): expected \(2,\), the shape of Toy\.",
+        ),
+        ('View("webcam"', 'View("webcm"', r"^\[task\] toy: camera 'webcm': expected one of the scene's: room, webcam"),
+        ("camera_hz=30", "camera_hz=0", r"^\[tasks\] toy = 'toy:Toy': .*: Rates: camera_hz = 0: expected at least 1"),
+        ('<body name="cart"', "<bdy", r"^\[task\] toy: the scene of Toy: XML parse error"),
+        ('<body name="cart"', '<body nme="cart"', r"^\[task\] toy: the scene of Toy: XML Error: .*'nme'"),
+        ('size=".05 .04 .02"', 'size=".05"', r"^\[task\] toy: the scene of Toy: Error: "),
+    ],
+)
+def test_what_is_wrong_in_the_file_is_named(my_robots, right, wrong, match):
+    file = my_robots / "toy.py"
+    text = file.read_text(encoding="utf-8")
+    assert text.count(right) == 1
+    file.write_text(text.replace(right, wrong), encoding="utf-8")
+    with pytest.raises(ConfigError, match=match):
+        load_task("toy", rows=rows(), rng=np.random.default_rng(0))
+
+
 def test_at_the_rails_end_the_cart_rests_whatever_is_commanded(my_robots):
     task = begun(max_speed=5.0)
     task.command(task.spec.action_high)

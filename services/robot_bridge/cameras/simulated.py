@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from common.errors import ConfigError
 from common.messages import UInt8Array
 from services.robot_bridge.cameras.base import Camera, CameraFrame
 from services.robot_bridge.mujoco_without_opengl import mujoco
@@ -47,7 +48,13 @@ class SimulatedCamera(Camera):
         height: of a frame, pixels.
         width: of a frame, pixels.
         defects: of the camera; None: it has none.
+
+        Raises:
+            ConfigError: the scene has no camera of this name.
         """
+        names = [model.camera(number).name for number in range(model.ncam)]
+        if name not in names:
+            raise ConfigError(f"camera {name!r}: expected one of the scene's: {', '.join(names) or 'it has none'}")
         self._model, self._name = model, name
         self._window = Window(0, 0, height, width, height, width)
         self._defects = defects or CameraDefects()

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.errors import ServiceError
+from common.errors import ConfigError, ServiceError
 from common.messages import Float32Array
 from services.robot_bridge.cameras.simulated import BUFFERED_FRAMES, SimulatedCamera
 from services.robot_bridge.robots.base import SimulatedRobot
@@ -30,6 +30,11 @@ class Rates:
     """Between two packets of the sensors."""
     camera_hz: int
     """Frames a second."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value < 1:
+                raise ConfigError(f"Rates: {name} = {value}: expected at least 1")
 
 
 @dataclass(frozen=True)

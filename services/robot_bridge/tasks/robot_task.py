@@ -16,7 +16,7 @@ import numpy as np
 
 from common.clock import Clock
 from common.config import setting
-from common.errors import ServiceError
+from common.errors import ConfigError, ServiceError
 from common.messages import Float32Array, TaskSpec, UInt8Array
 from services.robot_bridge.cameras.base import CameraFrame
 from services.robot_bridge.cameras.simulated import BUFFERED_FRAMES, CameraDefects, SimulatedCamera
@@ -26,6 +26,8 @@ from services.robot_bridge.robots.sensed_world import Rates, SensedWorld
 from services.robot_bridge.target_detection import ColourRange
 from services.robot_bridge.tasks.base import Outcome, SensorReading, Task
 
+MUJOCO_SAYS = ("XML", "Error")
+"""So begins what MuJoCo says of a scene that it cannot build, in a ValueError."""
 _LARGEST_SEED = 2**63 - 1
 DISTURBED: Mapping[str, float] = {
     "camera_latency": 0.03,
@@ -82,7 +84,7 @@ class RobotTask(Task):
         self, settings: RobotSettings, *, name: str, preset: str, pacing: str, rng: np.random.Generator
     ) -> None:
         self._settings, self._rng = settings, rng
-        self.robot = self._build_robot()
+        self.robot = self._robot()
         """The robot; in real time the world's thread alone may touch it from :meth:`start` on."""
         self.spec = self._describe(name, preset, pacing)
         self._world: SensedWorld | LiveWorld = self._build_world(self.robot)
@@ -94,6 +96,12 @@ class RobotTask(Task):
         """From the camera's count to a reading's ids; None while an attempt's first frame has not been read."""
         self._goal = np.zeros(0)
         self.begin_episode()
+        felt, expected = np.shape(self.robot.sense()), self.spec.proprioception_low.shape
+        if felt != expected:
+            raise ConfigError(
+                f"{type(self.robot).__name__}.sense() gives shape {felt}: expected {expected}, the shape of "
+                f"{type(self).__name__}._proprioception_limits()"
+            )
 
     # ------------------------------------------------------------------ what a subclass says
 
@@ -198,6 +206,14 @@ class RobotTask(Task):
             self._newest_frame = self._collected[-1]
 
     # ------------------------------------------------------------------ construction
+
+    def _robot(self) -> SimulatedRobot:
+        try:
+            return self._build_robot()
+        except ValueError as error:
+            if not str(error).startswith(MUJOCO_SAYS):
+                raise
+            raise ConfigError(f"the scene of {type(self).__name__}: {error}") from error
 
     def _build_world(self, robot: SimulatedRobot) -> SensedWorld:
         settings, view = self._settings, self.VIEW
