@@ -8,8 +8,9 @@ the mask, and the bounds beside it give nearly the same share.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -61,14 +62,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         ranges = _ranges(options)
         frame = read_picture(options.image)
+        paths = {name: options.out / f"{name}.png" for name in ranges}
+        _refuse_to_overwrite(options.image, paths.values())
         for name, colours in ranges.items():
             rows = variations(frame, colours, options.spread, options.columns)
             mask = colour_mask(frame, colours)
-            path = options.out / f"{name}.png"
             warning = mask_warning(mask)
-            _write(path, draw_sheet(frame, f"{name}: {colours.space.channels}  {colours}", mask, rows, warning))
+            _write(paths[name], draw_sheet(frame, f"{name}: {colours.space.channels}  {colours}", mask, rows, warning))
             print(_table(name, colours, mask, rows))
-            print(f"  {path}\n")
+            print(f"  {paths[name]}\n")
             if warning:
                 print(f"{PROGRAM}: warning: {name}: {warning}", file=sys.stderr)
     except RelodError as error:
@@ -132,6 +134,13 @@ def read_picture(path: Path) -> UInt8Array:
         picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
     frame: UInt8Array = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
     return frame
+
+
+def _refuse_to_overwrite(image: Path, paths: Iterable[Path]) -> None:
+    for path in paths:
+        with contextlib.suppress(OSError):  # it is not there, or cannot be looked at: writing will tell
+            if path.samefile(image):
+                raise ConfigError(f"--out {path.parent}: {path} is the picture itself, --image; choose another")
 
 
 def _write(path: Path, sheet: UInt8Array) -> None:

@@ -145,6 +145,17 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path, capsys):
     assert f"error: --out {out}: cannot be written to: Not a directory; choose another" in err
 
 
+def test_the_picture_itself_is_not_drawn_over(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    image = picture(tmp_path, name="create.png")
+    content = image.read_bytes()
+    code, out, err = run(capsys, "--image", "create.png", "--out", tmp_path)
+    assert (code, out) == (1, "")
+    assert f"error: --out {tmp_path}: {image} is the picture itself, --image; choose another" in err
+    assert list(tmp_path.iterdir()) == [image]
+    assert image.read_bytes() == content
+
+
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
