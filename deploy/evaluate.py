@@ -18,6 +18,7 @@ import numpy as np
 
 from common.codec import decode
 from common.config import load_config
+from common.console import Console
 from common.errors import ConfigError, MessageError, RelodError
 from common.frame_encoding import FrameEncoding, encode_frames, pixels_of
 from common.frame_stack import FrameStack
@@ -25,11 +26,10 @@ from common.messages import Float32Array, PolicyWeights, UInt8Array
 from common.pending_actions import PendingActions, observed_spec
 from common.policies import Observation, Policy, pending_actions_of, policy_from_weights
 from common.record import write_atomically
+from common.stop_signals import INTERRUPTED, StopSignals
 from common.topics import LEARNER, ROBOT_BRIDGE
-from deploy.console import Console
 from deploy.mirror import BRIDGE_CONFIGURATION
 from deploy.record_folders import find_file
-from deploy.stop_signals import INTERRUPTED, StopSignals
 from services.robot_bridge.bookkeeping import STEP_REWARD_IN_RESET, Ledger
 from services.robot_bridge.config import RobotBridgeConfig
 from services.robot_bridge.tasks import Task, load_task

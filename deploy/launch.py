@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from common.errors import RelodError
-from deploy.stop_signals import StopSignals
+from common.stop_signals import StopSignals
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.WARNING, format="deploy.launch: %(message)s")
     with StopSignals() as stop:
         # Imported only now, because it takes a moment in which Ctrl-C should be heard.
-        from deploy.console import Console
+        from common.console import Console
         from deploy.options import parse_options
         from deploy.run import launch, write_configurations
         from deploy.side import launch_side

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from deploy.console import Console
+from common.console import Console
 from deploy.network import Host
 from deploy.other_side import ENDED, News
 from deploy.watch import OVERTIME_S, EarlyEnd

@@ -12,11 +12,12 @@ from typing import Any
 import tomli_w
 
 from common.config import to_tables
+from common.console import Console
 from common.errors import ConfigError
+from common.stop_signals import INTERRUPTED, StopSignals
 from common.topics import LEARNER, ROBOT_BRIDGE
 from deploy.child import LaunchedService
 from deploy.computers import TwoComputers
-from deploy.console import Console
 from deploy.network import HOSTS, NetworkLink, NoLink, open_link
 from deploy.options import NO_NETWORK, LaunchOptions
 from deploy.placement import Placement
@@ -25,7 +26,6 @@ from deploy.ports import reserved_ports
 from deploy.progress import ProgressReader
 from deploy.run_file import RunFile, versions
 from deploy.run_record import read_record
-from deploy.stop_signals import INTERRUPTED, StopSignals
 from deploy.summary import summarise, write_curve, write_summary
 from deploy.summary_text import summary_text
 from deploy.watch import Drawing, EarlyEnd, watch

@@ -7,13 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from common.console import Console
 from common.errors import ConfigError
 from common.run_settings import RunSettings, TransportSettings
+from common.stop_signals import INTERRUPTED, StopSignals
 from common.topics import ROBOT_BRIDGE, Lane
 from common.transport import ZenohTransport
 from deploy.agreement import RELEASE, RUN_ID, differences, facts_of, host_fact
 from deploy.computers import TwoComputers, other_host
-from deploy.console import Console
 from deploy.listener import INTERRUPTED_S, SILENT_S, Listener
 from deploy.mirror import write_ring_counts
 from deploy.network import HOSTS, Host
@@ -25,7 +26,6 @@ from deploy.progress import ProgressReader
 from deploy.run import launched_services, run_file, summarise_run, write_tables
 from deploy.run_file import REPOSITORY
 from deploy.run_record import RING, read_record
-from deploy.stop_signals import INTERRUPTED, StopSignals
 from deploy.watch import OVERTIME_S, Drawing, watch
 
 SIDE_PORTS = PORTS + len(HOSTS) * len(Lane)

@@ -9,12 +9,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from common.console import Console
 from common.service import DRAIN_TIMEOUT_S
+from common.stop_signals import StopSignals
 from deploy.child import LaunchedService
-from deploy.console import Console
 from deploy.curve import load_drawing
 from deploy.progress import ProgressReader, progress_line
-from deploy.stop_signals import StopSignals
 from deploy.supervise import Supervisor
 
 OVERTIME_S = DRAIN_TIMEOUT_S + 10.0

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from common.console import Console
 from common.errors import RelodError
-from deploy.console import Console
-from deploy.stop_signals import INTERRUPTED
+from common.stop_signals import INTERRUPTED
 
 
 def exit_code(program: str, option: str, folder: Path, console: Console, run: Callable[[], int]) -> int:

@@ -12,8 +12,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from common.console import Console
 from common.record import write_atomically
-from deploy.console import Console
 from experiments.command_line import exit_code
 from experiments.grid import GridRecord
 from experiments.loading import uninterrupted

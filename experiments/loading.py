@@ -9,7 +9,7 @@ from types import FrameType
 from typing import NoReturn, TypeVar
 
 from common.algorithms import load_algorithm
-from deploy.stop_signals import StopSignals
+from common.stop_signals import StopSignals
 
 Made = TypeVar("Made")
 

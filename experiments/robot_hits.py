@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
+from common.console import Console
 from common.errors import ConfigError
 from common.record import write_atomically
-from deploy.console import Console
 from experiments.command_line import exit_code
 from experiments.grid import GridRecord
 from experiments.loading import uninterrupted

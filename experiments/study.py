@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from deploy.console import Console
-from deploy.stop_signals import INTERRUPTED, StopSignals
+from common.console import Console
+from common.stop_signals import INTERRUPTED, StopSignals
 from experiments.grid import GridError, GridRecord, Row, run_grid
 from experiments.run_folders import FolderJob, keep_crashed, remove_half_finished, runs_folder
 from experiments.workers import JobFailure, Key, Work, WorkerPool

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from deploy.console import Console
+from common.console import Console
 from experiments.command_line import exit_code
 from experiments.grid import Row
 from experiments.run_folders import FolderJob

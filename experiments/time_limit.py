@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
+from common.console import Console
 from common.errors import ConfigError, RelodError
 from common.record import write_atomically
-from deploy.console import Console
-from deploy.stop_signals import INTERRUPTED, StopSignals
+from common.stop_signals import INTERRUPTED, StopSignals
 from experiments.command_line import exit_code
 from experiments.grid import GridRecord, failure_text, key_text, run_grid
 from experiments.loading import uninterrupted

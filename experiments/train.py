@@ -23,15 +23,15 @@ from pathlib import Path
 from typing import Any
 
 from common.algorithms import ALGORITHMS
+from common.console import Console
 from common.errors import ConfigError, RelodError, ServiceError
+from common.stop_signals import INTERRUPTED, StopSignals
 from common.topics import LEARNER, ROBOT_BRIDGE
-from deploy.console import Console
 from deploy.network import PRESETS
 from deploy.options import HOST_BUDGET_HELP, default_run_name
 from deploy.placement import mode_names
 from deploy.progress import ProgressReader, progress_line
 from deploy.run_file import IN_PROCESS
-from deploy.stop_signals import INTERRUPTED, StopSignals
 from deploy.summary import read_record, summarise, write_curve, write_summary
 from deploy.summary_text import summary_text
 from experiments.command_line import exit_code

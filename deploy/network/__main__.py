@@ -8,8 +8,8 @@ import sys
 from collections.abc import Sequence
 
 from common.errors import RelodError
+from common.stop_signals import INTERRUPTED
 from deploy.network.check import add_check_arguments, run_check
-from deploy.stop_signals import INTERRUPTED
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

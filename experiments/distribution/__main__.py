@@ -10,7 +10,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from deploy.console import Console
+from common.console import Console
 from experiments.distribution.figures import draw_figures
 from experiments.distribution.jobs import work
 from experiments.distribution.plan import Plan

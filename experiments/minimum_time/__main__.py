@@ -10,7 +10,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from deploy.console import Console
+from common.console import Console
 from experiments.grid import Row, duration_text
 from experiments.minimum_time.figures import draw_figures
 from experiments.minimum_time.jobs import work

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.console import Console
+from common.console import Console
 from experiments.plain_sac.loop import run
 from experiments.train import Training, train
 

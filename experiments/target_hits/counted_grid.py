@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from deploy.console import Console
-from deploy.stop_signals import INTERRUPTED, StopSignals
+from common.console import Console
+from common.stop_signals import INTERRUPTED, StopSignals
 from experiments.grid import GridRecord, failure_text, run_grid
 from experiments.target_hits.jobs import relative_cost, work
 from experiments.wording import counted

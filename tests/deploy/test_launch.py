@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 
 from common.config import load_config
+from common.console import Console
+from common.stop_signals import INTERRUPTED, StopSignals
 from deploy import launch, run
-from deploy.console import Console
 from deploy.options import parse_options
 from deploy.placement import MODES
 from deploy.plan import CONFIG_CLASSES
-from deploy.stop_signals import INTERRUPTED, StopSignals
 
 REPOSITORY = Path(__file__).parents[2]
 PATIENCE_S = 60.0

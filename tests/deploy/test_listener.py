@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from deploy.console import Console
+from common.console import Console
 from deploy.listener import INTERRUPTED_S, SILENT_S, Listener
 from deploy.network import Host
 from deploy.other_side import ENDED, RUNNING, News

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from common.console import Console
 from common.errors import ConfigError
-from deploy.console import Console
 from experiments.command_line import exit_code
 
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
+from common.console import Console
 from common.errors import ServiceError
-from deploy.console import Console
-from deploy.stop_signals import StopSignals
+from common.stop_signals import StopSignals
 from deploy.summary import read_record, summarise
 from experiments import in_process
 from experiments.train import Training, train

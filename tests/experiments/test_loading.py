@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.stop_signals import StopSignals
+from common.stop_signals import StopSignals
 from experiments.loading import load_libraries, uninterrupted
 
 ROOT = Path(__file__).parents[2]
@@ -58,7 +58,7 @@ def test_a_stop_that_came_before_loads_nothing(monkeypatch):
 def test_nothing_of_torch_is_left_for_the_services_to_load():
     program = """
 import sys
-from deploy.stop_signals import StopSignals
+from common.stop_signals import StopSignals
 from experiments.loading import load_libraries, uninterrupted
 load_libraries("sac", StopSignals())
 before = set(sys.modules)

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from common.console import Console
 from common.errors import ConfigError, MessageError
-from deploy.console import Console
+from common.stop_signals import StopSignals
 from deploy.episodes import EpisodeTable
-from deploy.stop_signals import StopSignals
 from experiments.train import Training, main, train
 from tests.experiments.small_algorithm import SMALL_ALGORITHM
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from common.console import Console
 from common.errors import ConfigError
-from deploy.console import Console
 from deploy.episodes import EpisodeTable
 from deploy.summary import read_record, summarise
 from experiments.train import Training, main, train

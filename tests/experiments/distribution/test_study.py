@@ -5,7 +5,7 @@ import tomllib
 
 import pytest
 
-from deploy.stop_signals import INTERRUPTED
+from common.stop_signals import INTERRUPTED
 from experiments.distribution.__main__ import main
 from experiments.distribution.jobs import DistributionError, Job, work
 from experiments.study import SO_FAR

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.stop_signals import INTERRUPTED
+from common.stop_signals import INTERRUPTED
 from experiments.minimum_time.__main__ import main
 from experiments.minimum_time.jobs import HITS, TRAINING, Job, StudyError, work
 from tests.experiments.minimum_time.rows_by_hand import (

@@ -1,4 +1,4 @@
-"""What the launcher says: lines, and one status line that a terminal rewrites."""
+"""What a program says: lines, and one status line that a terminal rewrites."""
 
 from __future__ import annotations
 

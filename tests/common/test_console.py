@@ -1,11 +1,11 @@
-"""The launcher's output: a status line that is rewritten in a terminal, and sparse elsewhere."""
+"""A program's output: a status line that is rewritten in a terminal, and sparse elsewhere."""
 
 import io
 import os
 
 import pytest
 
-from deploy.console import PLAIN_PERIOD_S, Console
+from common.console import PLAIN_PERIOD_S, Console
 
 
 class Terminal(io.StringIO):

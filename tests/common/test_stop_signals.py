@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from deploy.stop_signals import StopSignals
+from common.stop_signals import StopSignals
 
 
 @pytest.mark.parametrize(("second_s", "asked_again"), [(10.49, False), (10.5, True), (60.0, True)])
