@@ -190,7 +190,7 @@ def _serve_function(name: str) -> Callable[[Service, Any], None]:
     """What ``python -m services.NAME`` runs."""
     match name:
         case "robot_bridge":
-            from services.robot_bridge.__main__ import serve
+            from services.robot_bridge.serve import serve
         case "actor":
             from services.actor.__main__ import serve
         case "replay":

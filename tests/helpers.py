@@ -1,4 +1,4 @@
-"""Messages with sensible contents, and waiting for what another thread brings about."""
+"""Messages with sensible contents, outputs that cannot be used, and waiting for what another thread brings about."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import itertools
 import os
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -88,3 +88,15 @@ def eventually(holds: Callable[[], object], what: str = "it") -> None:
     while not holds():
         assert time.monotonic() < deadline, f"{what} never came about"
         time.sleep(0.002)
+
+
+@contextlib.contextmanager
+def unusable_output(what: str) -> Iterator[TextIO]:
+    """An output, written line by line, whose device is ``full`` or whose reader has ``closed`` it."""
+    if what == "full":
+        descriptor = os.open("/dev/full", os.O_WRONLY)
+    else:
+        reading, descriptor = os.pipe()
+        os.close(reading)
+    with os.fdopen(descriptor, "w", buffering=1, encoding="utf-8") as output:
+        yield output

@@ -80,7 +80,7 @@ def run_blocked(code, *arguments):
 @pytest.mark.parametrize(
     "module",
     [
-        "services.robot_bridge.__main__",
+        "services.robot_bridge.serve",
         "services.replay.__main__",
         "services.actor.__main__",
         "services.robot_bridge.tasks.visual_dot_reacher",

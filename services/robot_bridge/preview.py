@@ -7,8 +7,7 @@ what of it is taken for the target, and the robot from outside.
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +16,10 @@ from typing import Any
 import numpy as np
 
 from common.config import parse_override
+from common.console import Console
 from common.errors import ConfigError, RelodError
 from common.messages import TaskSpec, UInt8Array
+from common.stop_signals import INTERRUPTED, StopSignals
 from services.robot_bridge.preview_pictures import contact_sheet, panels, write_picture, write_video
 from services.robot_bridge.rendering import OffscreenCamera, Window
 from services.robot_bridge.robots.base import ROOM_CAMERA, SimulatedRobot
@@ -49,26 +50,47 @@ class Moment:
     """True if the episode ends here."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw what the command line asks for; return the exit code."""
+def main(arguments: Sequence[str], stop: StopSignals) -> int:
+    """Draw what the command line asks for; return the exit code.
+
+    Args:
+        arguments: of the command line.
+        stop: when to give up; what is being written by then is still completed.
+    """
     options = _parser().parse_args(arguments)
+    console = Console()
     try:
-        task = _task(options)
-        with closing(task):
-            name = task.spec.task
-            shown = [(moment, panels(moment.frame, moment.mask, moment.room)) for moment in moments(task, options.seed)]
-        pictures = [picture for _, picture in shown]
-        paths = options.preview / f"{name}.png", options.preview / f"{name}.mp4"
-        write_picture(paths[0], contact_sheet([(_label(moment), picture) for moment, picture in shown]))
-        write_video(paths[1], pictures, 1 / task.spec.action_cycle_time_s)
+        return _draw(options, stop, console)
+    except KeyboardInterrupt:
+        console.line("interrupted before anything was written")
+        return INTERRUPTED
     except RelodError as error:
-        print(f"{PROGRAM}: error: {error}", file=sys.stderr)
+        console.error(f"{PROGRAM}: error: {error}")
         return 1
-    print("\n".join(str(path) for path in paths))
-    return 0
 
 
-def moments(task: RobotTask, seed: int) -> Iterator[Moment]:
+def _draw(options: argparse.Namespace, stop: StopSignals, console: Console) -> int:
+    _end_if_asked(stop)
+    shown = []
+    with closing(_task(options)) as task, closing(moments(task, options.seed)) as coming:
+        name = task.spec.task
+        for moment in coming:
+            _end_if_asked(stop)
+            shown.append((moment, panels(moment.frame, moment.mask, moment.room)))
+    paths = options.preview / f"{name}.png", options.preview / f"{name}.mp4"
+    write_picture(paths[0], contact_sheet([(_label(moment), picture) for moment, picture in shown]))
+    write_video(paths[1], [picture for _, picture in shown], 1 / task.spec.action_cycle_time_s)
+    for path in paths:
+        console.line(str(path))
+    return INTERRUPTED if stop.asked else 0
+
+
+def _end_if_asked(stop: StopSignals) -> None:
+    if stop.asked:
+        raise KeyboardInterrupt
+
+
+def moments(task: RobotTask, seed: int) -> Generator[Moment, None, None]:
     """Let the initial policy, tanh of N(0, 1), act in a task in lockstep, episode after episode."""
     spec = task.spec
     cycle_ns = round(spec.action_cycle_time_s * 1e9)

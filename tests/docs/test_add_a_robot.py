@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from common.errors import ConfigError
+from common.stop_signals import StopSignals
 from experiments import hits
 from services.robot_bridge import preview, rendering
 from services.robot_bridge.tasks import TASKS, load_task
@@ -142,7 +143,7 @@ def test_the_pages_preview_shows_the_cart(my_robots, tmp_path, monkeypatch, caps
     monkeypatch.setattr(preview, "ROOM_HEIGHT", 108)
     monkeypatch.setattr(rendering, "SHADOW_MAP", 128)
     monkeypatch.chdir(tmp_path)
-    assert preview.main(command("services.robot_bridge")) == 0
+    assert preview.main(command("services.robot_bridge"), StopSignals()) == 0
     sheet, video = capsys.readouterr().out.split()
     picture = cv2.imread(sheet)
     assert picture is not None

@@ -17,9 +17,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from common.console import Console
 from common.errors import ConfigError, RelodError
 from common.messages import UInt8Array
 from common.record import write_atomically
+from common.stop_signals import INTERRUPTED
 from services.robot_bridge.target_detection import (
     TARGET_COLOURS,
     Colour,
@@ -59,9 +61,10 @@ class Variation:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the sheets and print the shares; return the exit code."""
     options = _parser().parse_args(arguments)
+    console = Console()
     try:
         ranges = _ranges(options)
-        frame = read_picture(options.image)
+        frame = read_picture(options.image, console)
         paths = {name: options.out / f"{name}.png" for name in ranges}
         _refuse_to_overwrite(options.image, paths.values())
         for name, colours in ranges.items():
@@ -69,12 +72,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             mask = colour_mask(frame, colours)
             warning = mask_warning(mask)
             _write(paths[name], draw_sheet(frame, f"{name}: {colours.space.channels}  {colours}", mask, rows, warning))
-            print(_table(name, colours, mask, rows))
-            print(f"  {paths[name]}\n")
+            console.line(_table(name, colours, mask, rows))
+            console.line(f"  {paths[name]}\n")
             if warning:
-                print(f"{PROGRAM}: warning: {name}: {warning}", file=sys.stderr)
+                console.error(f"{PROGRAM}: warning: {name}: {warning}")
+    except KeyboardInterrupt:
+        console.line("interrupted")
+        return INTERRUPTED
     except RelodError as error:
-        print(f"{PROGRAM}: error: {error}", file=sys.stderr)
+        console.error(f"{PROGRAM}: error: {error}")
         return 1
     return 0
 
@@ -114,8 +120,8 @@ def _variation(
     return Variation(f"{colours.space.channels[channel]} {sign} {value}", is_given, colour_mask(frame, moved))
 
 
-def read_picture(path: Path) -> UInt8Array:
-    """Return the picture in a file, (H, W, 3) red first, no larger than :data:`LONGEST_SIDE`.
+def read_picture(path: Path, console: Console) -> UInt8Array:
+    """Return the picture in a file, (H, W, 3) red first, scaled to :data:`LONGEST_SIDE` if larger, which is said.
 
     Raises:
         ConfigError: there is no such file, or it is no picture.
@@ -130,7 +136,7 @@ def read_picture(path: Path) -> UInt8Array:
     longest = max(picture.shape[:2])
     if longest > LONGEST_SIDE:
         height, width = (max(1, n * LONGEST_SIDE // longest) for n in picture.shape[:2])
-        print(f"{path}: {picture.shape[1]}x{picture.shape[0]} pixels, scaled to {width}x{height}\n")
+        console.line(f"{path}: {picture.shape[1]}x{picture.shape[0]} pixels, scaled to {width}x{height}\n")
         picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
     frame: UInt8Array = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
     return frame

@@ -8,8 +8,8 @@ from common import topics
 from common.config import build_config
 from common.errors import CameraError, ConfigError
 from common.transport import InMemoryNetwork
-from services.robot_bridge.__main__ import serve
 from services.robot_bridge.config import RobotBridgeConfig
+from services.robot_bridge.serve import serve
 from tests.services.builders import EventClock, SoloService
 from tests.services.robot_bridge.cameras.pictures import SIZE, write_video
 

@@ -1,15 +1,29 @@
 """A robot's task to look at: what is drawn, what is written, and clear words where it cannot be."""
 
 import itertools
+import os
+import signal
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from common.errors import ServiceError
+from common.stop_signals import StopSignals
 from services.robot_bridge import __main__, preview, rendering
-from services.robot_bridge.preview_pictures import COLUMNS, GAP, LABEL_HEIGHT, TILE_WIDTH, TILES, contact_sheet, panels
+from services.robot_bridge.preview_pictures import (
+    COLUMNS,
+    GAP,
+    LABEL_HEIGHT,
+    TILE_WIDTH,
+    TILES,
+    contact_sheet,
+    panels,
+    write_video,
+)
 from services.robot_bridge.tasks import load_task
+from tests.helpers import unusable_output
 from tests.services.robot_bridge.opengl import skip_without_opengl
 
 FRANKA = "franka_visual_reacher"
@@ -26,8 +40,8 @@ def opengl(monkeypatch):
     monkeypatch.setattr(rendering, "SHADOW_MAP", 128)
 
 
-def run(directory, *arguments, task=FRANKA):
-    return preview.main(["--task", task, "--preview", str(directory), *arguments])
+def run(directory, *arguments, task=FRANKA, stop=None):
+    return preview.main(["--task", task, "--preview", str(directory), *arguments], stop or StopSignals())
 
 
 def video_frames(path):
@@ -120,6 +134,71 @@ def test_a_sheet_goes_from_the_first_to_the_last(count, tiles):
     assert (sheet[top : top + 270, left : left + TILE_WIDTH] == count - 1).all()
 
 
+# ---------------------------------------------------------------------- how it ends
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """A stand-in for a task; its three moments need no OpenGL, and something may happen at each, ``at_moment``."""
+    asked = []
+    task = SimpleNamespace(
+        spec=SimpleNamespace(task="toy", action_cycle_time_s=0.5),
+        close=lambda: asked.append("close"),
+        asked=asked,
+        at_moment={},
+    )
+
+    def moments(task, seed):
+        picture = np.zeros((9, 16, 3), np.uint8)
+        for number in range(3):
+            task.at_moment.get(number, lambda: None)()
+            yield preview.Moment(0.5 * number, frame=picture, mask=None, room=picture, at_goal=False)
+
+    monkeypatch.setattr(preview, "_task", lambda options: task)
+    monkeypatch.setattr(preview, "moments", moments)
+    return task
+
+
+def press_ctrl_c():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("output", ["full", "closed"])
+def test_it_is_drawn_though_nobody_can_read_where(drawn, tmp_path, monkeypatch, output):
+    with unusable_output(output) as stdout:
+        monkeypatch.setattr("sys.stdout", stdout)
+        assert run(tmp_path, task="toy") == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["toy.mp4", "toy.png"]
+
+
+@pytest.mark.parametrize("number", [0, 2])
+def test_ctrl_c_is_a_line_and_leaves_nothing(drawn, tmp_path, capsys, number):
+    drawn.at_moment[number] = press_ctrl_c
+    with StopSignals() as stop:
+        assert run(tmp_path, task="toy", stop=stop) == 130
+    assert capsys.readouterr() == ("interrupted before anything was written\n", "")
+    assert drawn.asked == ["close"]
+    assert not list(tmp_path.iterdir())
+
+
+def test_ctrl_c_lets_what_is_being_written_be_completed(drawn, tmp_path, capsys, monkeypatch):
+    def write(*arguments):
+        press_ctrl_c()
+        write_video(*arguments)
+
+    monkeypatch.setattr(preview, "write_video", write)
+    with StopSignals() as stop:
+        assert run(tmp_path, task="toy", stop=stop) == 130
+    assert capsys.readouterr().out.split() == [str(tmp_path / "toy.png"), str(tmp_path / "toy.mp4")]
+    assert len(video_frames(tmp_path / "toy.mp4")[0]) == 3
+
+
+def test_ctrl_c_is_heard_from_the_start(tmp_path, capsys):
+    with StopSignals() as stop:
+        press_ctrl_c()
+        assert run(tmp_path, task="nobody", stop=stop) == 130
+
+
 # ---------------------------------------------------------------------- bad input
 
 
@@ -159,7 +238,11 @@ def test_without_opengl_the_error_says_what_to_do(tmp_path, capsys, monkeypatch)
 
 @pytest.mark.parametrize("argument", ["--preview", "--preview=x", "--task", "--task=x"])
 def test_the_bridges_command_line_knows_who_wants_a_preview(argument, monkeypatch):
-    monkeypatch.setattr(preview, "main", lambda arguments: 7 if arguments == ["first", argument] else 1)
+    def main(arguments, stop):
+        press_ctrl_c()  # held back by now
+        return 7 if stop.asked and arguments == ["first", argument] else 1
+
+    monkeypatch.setattr(preview, "main", main)
     with pytest.raises(SystemExit) as ended:
         __main__.main(["first", argument])
     assert ended.value.code == 7
@@ -167,7 +250,7 @@ def test_the_bridges_command_line_knows_who_wants_a_preview(argument, monkeypatc
 
 def test_help_names_both_options_and_gives_an_example(capsys):
     with pytest.raises(SystemExit) as ended:
-        preview.main(["--help"])
+        preview.main(["--help"], StopSignals())
     assert ended.value.code == 0
     text = capsys.readouterr().out
     assert all(part in text for part in ("--task T", "--preview DIR", "example:"))

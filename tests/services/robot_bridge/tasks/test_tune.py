@@ -4,9 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
+from common.console import Console
 from services.robot_bridge.target_detection import TARGET_COLOURS, ColourRange, ColourSpace, colour_mask
+from services.robot_bridge.tasks import tune
 from services.robot_bridge.tasks.tune import LONGEST_SIDE, main, read_picture, variations
 from services.robot_bridge.tasks.tune_sheet import _INSIDE, GAP, LABEL_HEIGHT, TILE_WIDTH, draw_sheet
+from tests.helpers import unusable_output
 
 
 def picture(directory, colour=(0, 0, 255), height=90, width=160, name="picture.png"):
@@ -92,7 +95,7 @@ def test_a_mask_that_is_all_or_nothing_is_a_warning_and_still_drawn(tmp_path, ca
 
 def test_a_large_picture_is_scaled(tmp_path, capsys):
     path = picture(tmp_path, height=960, width=1280)
-    assert read_picture(path).shape == (LONGEST_SIDE * 3 // 4, LONGEST_SIDE, 3)
+    assert read_picture(path, Console()).shape == (LONGEST_SIDE * 3 // 4, LONGEST_SIDE, 3)
     assert "1280x960 pixels, scaled to 640x480" in capsys.readouterr().out
 
 
@@ -143,6 +146,29 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path, capsys):
     code, _, err = run(capsys, "--image", picture(tmp_path), "--out", out, "--robot", "vector")
     assert code == 1
     assert f"error: --out {out}: cannot be written to: Not a directory; choose another" in err
+
+
+@pytest.mark.parametrize("output", ["full", "closed"])
+def test_every_sheet_is_drawn_though_nobody_can_read_what_is_said(tmp_path, monkeypatch, output):
+    with unusable_output(output) as stdout:
+        monkeypatch.setattr("sys.stdout", stdout)
+        assert main(["--image", str(picture(tmp_path, height=960, width=1280)), "--out", str(tmp_path / "out")]) == 0
+    assert {path.stem for path in (tmp_path / "out").iterdir()} == set(TARGET_COLOURS)
+
+
+def test_ctrl_c_leaves_whole_sheets_and_no_traceback(tmp_path, capsys, monkeypatch):
+    robots = list(TARGET_COLOURS)
+
+    def draw(frame, title, *others):
+        if title.startswith(robots[1]):
+            raise KeyboardInterrupt
+        return draw_sheet(frame, title, *others)
+
+    monkeypatch.setattr(tune, "draw_sheet", draw)
+    code, out, err = run(capsys, "--image", picture(tmp_path), "--out", tmp_path / "out")
+    assert (code, err) == (130, "")
+    assert out.endswith("\ninterrupted\n")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [f"{robots[0]}.png"]
 
 
 def test_the_picture_itself_is_not_drawn_over(tmp_path, capsys, monkeypatch):
