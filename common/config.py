@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, field, fields, is_dataclass
@@ -20,7 +21,9 @@ from common.errors import ConfigError
 
 Config = TypeVar("Config")
 Tables = dict[str, dict[str, Any]]
-
+_NUMBERS = re.compile(r"[-+.,\[\]\s\d_eE]+")
+"""A number or a list of them, and nothing that is text."""
+_LEADING_POINT = re.compile(r"(?<![.\w])\.(?=\d)")
 _LARGEST_WHOLE = 2**63 - 1
 """Larger ones fit neither messages nor arrays."""
 
@@ -66,13 +69,17 @@ def read_toml(path: Path) -> Tables:
 
 
 def parse_override(override: str) -> tuple[str, str, Any]:
-    """Split ``section.key=value``; the value is TOML (``3``, ``true``, ``"text"``), or a bare word as text."""
+    """Split ``section.key=value``; the value is TOML (``3``, ``true``, ``"text"``), or a bare word as text.
+
+    Unlike in TOML, numbers may begin with their point: ``.5``, ``[-.25, .17]``.
+    """
     name, equals, text = override.partition("=")
     section, dot, key = name.strip().partition(".")
     if not (equals and dot and section and key):
         raise ConfigError(f"--set {override!r}: expected section.key=value, for example task.preset=thesis")
+    toml = _LEADING_POINT.sub("0.", text) if _NUMBERS.fullmatch(text) else text
     try:
-        return section, key, tomllib.loads(f"value = {text}")["value"]
+        return section, key, tomllib.loads(f"value = {toml}")["value"]
     except ValueError:
         return section, key, text.strip()
 
@@ -140,16 +147,17 @@ def _checked(hint: Any, value: Any, item: dataclasses.Field[Any], where: str) ->
     kind = get_origin(hint) or hint
     if isinstance(value, int) and abs(value) > _LARGEST_WHOLE:
         raise ConfigError(f"{where} = {value}: expected a number of at most 64 bits")
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
+    if kind is float:
+        value = _as_float(value)
     wrong_bool = isinstance(value, bool) and kind is not bool
     if not isinstance(value, kind) or wrong_bool:
         raise ConfigError(f"{where} = {value!r}: expected {_type_name(hint)}")
     if kind is list:
         element = get_args(hint)[0]
-        if not all(isinstance(v, element) for v in value):
+        elements = [_as_float(v) for v in value] if element is float else list(value)
+        if not all(isinstance(v, element) for v in elements):
             raise ConfigError(f"{where} = {value!r}: expected {_type_name(hint)}")
-        return list(value)
+        return elements
     metadata = item.metadata
     if metadata.get("choices") and value not in metadata["choices"]:
         expected = ", ".join(metadata["choices"])
@@ -162,6 +170,11 @@ def _checked(hint: Any, value: Any, item: dataclasses.Field[Any], where: str) ->
     return value
 
 
+def _as_float(value: Any) -> Any:
+    """A whole number as the number that is wanted; anything else as it is."""
+    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
 def _range(low: float | None, high: float | None) -> str:
     if high is None:
         return f"at least {low}"
@@ -171,9 +184,15 @@ def _range(low: float | None, high: float | None) -> str:
 
 
 def _type_name(hint: Any) -> str:
-    return {str: "text", int: "a whole number", float: "a number", bool: "true or false"}.get(
-        hint, str(hint).replace("list[str]", "a list of texts")
-    )
+    names = {
+        str: "text",
+        int: "a whole number",
+        float: "a number",
+        bool: "true or false",
+        list[str]: "a list of texts",
+        list[float]: "a list of numbers",
+    }
+    return names.get(hint, str(hint))
 
 
 def _hint(name: Any, known: Iterable[str]) -> str:

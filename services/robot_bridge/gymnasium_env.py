@@ -54,13 +54,15 @@ class TaskEnv(Env[Observation, Float32Array]):
         task: task id, a key of the task table.
         preset: one of the task's presets; empty takes its default.
         render_mode: None or ``rgb_array``; a task without camera shows nothing and stays at None.
-        settings: the task's settings that win over the preset's, e.g. ``time_limit=100``.
+        settings: the task's settings that win over the preset's, e.g. ``time_limit=100``; tuples and arrays count as
+            lists.
 
         Raises:
             ConfigError: unknown task, preset, setting or render mode, or a value out of range.
         """
         self._rng = np.random.default_rng()
-        self._task = load_task(task, preset, settings, pacing="lockstep", rng=self._rng)
+        plain = {name: _plain(value) for name, value in settings.items()}
+        self._task = load_task(task, preset, plain, pacing="lockstep", rng=self._rng)
         self.task_spec = self._task.spec
         """What the task is, in physical units."""
         if render_mode not in (None, *TaskEnv.metadata["render_modes"]):
@@ -224,6 +226,15 @@ def _observation_space(spec: TaskSpec) -> spaces.Box | spaces.Dict:
     height, width, channels = (int(n) for n in spec.frame_shape)
     frames = spaces.Box(0, 255, (height, width, spec.frame_stack * channels), np.uint8)
     return spaces.Dict({"frames": frames, "proprioception": proprioception})
+
+
+def _plain(value: Any) -> Any:
+    """A setting as a configuration file gives it: without tuples, arrays and NumPy's numbers."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(element) for element in value]
+    return value
 
 
 def _new_goal_asked_for(options: dict[str, Any]) -> bool:

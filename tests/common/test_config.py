@@ -32,6 +32,7 @@ class Arm:
     grip: bool = setting(False)
     touch: str = setting("soft", choices=("soft", "stiff"))
     peers: list[str] = setting([])
+    posture: list[float] = setting([0.5, -0.5])
 
 
 @dataclass(frozen=True)
@@ -116,12 +117,22 @@ def test_the_ends_of_a_range_belong_to_it(tmp_path):
         ("touch = 2026-01-01", "expected text"),
         ('peers = "a"', "[arm] peers = 'a': expected a list of texts"),
         ('peers = ["a", 1]', "[arm] peers = ['a', 1]: expected a list of texts"),
+        ("posture = 1.5", "[arm] posture = 1.5: expected a list of numbers"),
+        ('posture = [1, "a"]', "[arm] posture = [1, 'a']: expected a list of numbers"),
+        ("posture = [0.5, true]", "[arm] posture = [0.5, True]: expected a list of numbers"),
+        ("posture = [[1, 2]]", "[arm] posture = [[1, 2]]: expected a list of numbers"),
     ],
 )
 def test_a_wrong_value_is_named_with_what_was_expected(tmp_path, line, expected):
     error = refused(tmp_path, f'[arm]\nname = "left"\n{line}\n')
     assert expected in error
     assert str(tmp_path / "arm.toml") in error
+
+
+def test_a_list_of_numbers_may_hold_whole_ones(tmp_path):
+    posture = load(tmp_path, '[arm]\nname = "left"\nposture = [0, 1.5, -2]\n').arm.posture
+    assert posture == [0.0, 1.5, -2.0]
+    assert {type(value) for value in posture} == {float}
 
 
 def test_a_wrong_choice_like_no_other_names_the_choices_once(tmp_path):
@@ -144,7 +155,7 @@ def test_an_unknown_key_comes_with_a_suggestion(tmp_path):
 
 def test_an_unknown_key_like_no_other_comes_with_the_known_ones(tmp_path):
     error = refused(tmp_path, '[arm]\nname = "left"\nxyz = 6\n')
-    assert error.endswith("unknown key 'xyz'; known: name, joints, speed, reach, offset, grip, touch, peers")
+    assert error.endswith("unknown key 'xyz'; known: name, joints, speed, reach, offset, grip, touch, peers, posture")
 
 
 def test_an_unknown_section_comes_with_a_suggestion(tmp_path):
@@ -229,6 +240,15 @@ def test_a_folder_is_no_file(tmp_path):
         ("arm.name='true'", ("arm", "name", "true")),
         ('arm.peers=["a", "b"]', ("arm", "peers", ["a", "b"])),
         ("arm.peers=[]", ("arm", "peers", [])),
+        ("arm.speed=.5", ("arm", "speed", 0.5)),
+        ("arm.speed=-.5", ("arm", "speed", -0.5)),
+        ("arm.speed= +.5e-1 ", ("arm", "speed", 0.05)),
+        ("arm.posture=[-.25,.17, 37.5,1]", ("arm", "posture", [-0.25, 0.17, 37.5, 1])),
+        ("arm.posture=[[.5],[1.5]]", ("arm", "posture", [[0.5], [1.5]])),
+        ("arm.name=..5", ("arm", "name", "..5")),
+        ("arm.name=.5.5", ("arm", "name", ".5.5")),
+        ("arm.name=.5 m", ("arm", "name", ".5 m")),
+        ('arm.peers=["a .5"]', ("arm", "peers", ["a .5"])),
         ("arm.peers=[a]", ("arm", "peers", "[a]")),  # bare words only where a text stands alone
         (" arm.joints = 3 ", ("arm", "joints", 3)),
         ("extra.deep.key=1", ("extra", "deep.key", 1)),

@@ -341,6 +341,22 @@ def test_preset_and_settings_reach_the_task():
     assert interface.reset()[1]["episode_steps"] == 4 + 20  # The preset's reset steps; the default has 10.
 
 
+@pytest.mark.parametrize(
+    "low", [[-0.5, 0, 0], (-0.5, 0, 0), np.array([-0.5, 0, 0], np.float32), [np.float32(-0.5), np.int64(0), 0.0]]
+)
+def test_a_list_may_be_a_tuple_or_an_array_and_hold_whole_numbers(low):
+    with pytest.raises(ConfigError, match=r"box_low = \[-0.5, 0.0, 0.0\]: .* box_high = \[-1.0, 1.0, 1.0\]"):
+        gymnasium.make("relod/Ur5VisualReacher-v0", box_low=low, box_high=(-1, 1, 1))
+    made = gymnasium.make("relod/Ur5VisualReacher-v0", box_low=low)
+    made.close()
+
+
+@pytest.mark.parametrize("low", [("a", 0, 0), np.zeros((1, 3)), np.array(["a", "b", "c"]), [True, 0, 0], 0, None])
+def test_what_is_no_list_of_numbers_is_refused(low):
+    with pytest.raises(ConfigError, match=r"box_low = .*: expected a list of numbers"):
+        gymnasium.make("relod/Ur5VisualReacher-v0", box_low=low)
+
+
 def test_several_run_side_by_side():
     vector = gymnasium.make_vec("relod/DotReacher-v0", 2, "sync", time_limit=3)
     observations, _ = vector.reset(seed=4)
