@@ -145,7 +145,8 @@ def _task(options: argparse.Namespace) -> RobotTask:
             raise ConfigError(f"--set {override}: only settings of the task count here: expected task.key=value")
         overrides[key] = value
     rows = {name: target} if equals else {}
-    task = load_task(name, options.preset, overrides, rows, rng=np.random.default_rng(options.seed))
+    preset = str(overrides.pop("preset", options.preset))
+    task = load_task(name, preset, overrides, rows, rng=np.random.default_rng(options.seed))
     if not isinstance(task, RobotTask):
         task.close()
         raise ConfigError(f"--task {name}: it is no simulated robot: expected one such as ur5_visual_reacher")

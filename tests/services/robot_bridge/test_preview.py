@@ -210,6 +210,8 @@ def test_ctrl_c_is_heard_from_the_start(tmp_path, capsys):
         (["--set", "run.id=x"], FRANKA, "--set run.id=x: only settings of the task count here"),
         (["--set", "task.bag_radius=0"], FRANKA, "bag_radius"),
         (["--preset", "thesis"], FRANKA, "preset = 'thesis'"),
+        (["--set", "task.preset=thesis"], FRANKA, "preset = 'thesis'"),
+        (["--preset", "thesis", "--set", "task.preset=[1]"], FRANKA, "preset = '[1]'"),
     ],
 )
 def test_what_cannot_be_drawn_is_named(arguments, task, match, tmp_path, capsys):
