@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from common.config import setting
+from common.errors import ConfigError
 from common.frame_encoding import FrameEncoding
 from common.run_settings import ClockSettings, JournalSettings, RunSettings, TransportSettings
 
@@ -35,6 +36,11 @@ class CameraSettings:
     name: str = setting("")
     """Kind of camera, a key of the camera table; empty: none."""
     overrides: dict[str, Any] = setting(rest=True)
+
+    def __post_init__(self) -> None:
+        if self.overrides and not self.name:
+            keys = ", ".join(sorted(self.overrides))
+            raise ConfigError(f"{keys}: expected camera.name as well, the kind of camera that is set so")
 
 
 @dataclass(frozen=True)

@@ -104,6 +104,12 @@ def test_a_wrong_setting_is_named_with_what_was_expected(tmp_path, settings, mat
         config_of(tmp_path, robot_bridge=settings)
 
 
+@pytest.mark.parametrize("name", [{}, {"name": ""}])
+def test_settings_of_a_camera_that_is_not_named_are_refused(tmp_path, name):
+    with pytest.raises(ConfigError, match=r"\[camera\]: file, rate: expected camera.name as well"):
+        config_of(tmp_path, camera={"rate": 30, "file": "lab.mp4", **name})
+
+
 def test_a_task_sees_through_the_camera_that_is_configured(tmp_path):
     write_part(tmp_path, 10, {"steps": 1})
     video = write_video(tmp_path / "video.avi", 5)
