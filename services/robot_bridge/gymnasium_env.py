@@ -175,7 +175,10 @@ class TaskEnv(Env[Observation, Float32Array]):
     def _physical(self, action: Any) -> Float32Array:
         shape = self.task_spec.action_low.shape
         try:
-            unit = np.asarray(action, np.float64)
+            unit = np.asarray(action)
+            if np.iscomplexobj(unit):  # NumPy would drop the imaginary part with no more than a warning
+                raise TypeError("complex")
+            unit = unit.astype(np.float64)
         except (TypeError, ValueError) as error:
             raise InvalidAction(f"{self.task_spec.task}: expected numbers of shape {shape}, got {action!r}") from error
         if unit.shape != shape:

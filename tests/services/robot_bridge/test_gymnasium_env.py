@@ -388,6 +388,8 @@ def test_stepping_needs_a_running_attempt(scripted):
         ([np.nan, 0.0], r"finite numbers in \[-1, 1\], got \[nan"),
         ([0.0, np.inf], r"finite numbers"),
         (["left", "up"], r"numbers of shape \(2,\), got \['left'"),
+        (np.array([1 + 1j, 0]), r"numbers of shape \(2,\), got array\(\[1.\+1.j"),
+        ([0.5j, 0.5], r"numbers of shape \(2,\), got \[0.5j"),
         (None, r"got shape \(\)"),
     ],
 )
