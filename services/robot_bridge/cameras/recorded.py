@@ -110,7 +110,9 @@ class RecordedCamera(Camera):
 def _decode(settings: RecordedCameraSettings, size: PictureSize, name: str) -> tuple[list[UInt8Array], float]:
     """Read the whole file; return its pictures, (H, W, C) red first, and their rate, Hz."""
     if not Path(settings.file).is_file():
-        raise CameraError(f"{name}: there is no such file; expected a video, camera.file = PATH")
+        is_folder = settings.file and Path(settings.file).is_dir()
+        found = "is a folder" if is_folder else "there is no such file"
+        raise CameraError(f"{name}: {found}; expected a video, camera.file = PATH")
     capture = cv2.VideoCapture(settings.file, cv2.CAP_FFMPEG)
     try:
         if not capture.isOpened():

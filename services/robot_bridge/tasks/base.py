@@ -101,7 +101,7 @@ class Task(ABC):
             CameraError: the camera cannot be used.
         """
         own = "draws its frames itself" if self.spec.has_camera else "has no camera"
-        raise ConfigError(f"[camera]: {self.spec.task} {own}; expected no camera, leave [camera] name empty")
+        raise ConfigError(f"[camera]: {self.spec.task} {own}; expected no camera, leave [camera] empty")
 
     def newest_frame_ns(self) -> int | None:
         """When the newest camera frame was taken, on the clock of :meth:`advance_to`, whether it has been read or not.

@@ -86,6 +86,16 @@ def test_what_is_no_video_is_named(tmp_path, content, match):
         open_camera("recorded", {"file": str(file)}, size=SIZE, clock=FakeClock())
 
 
+def test_a_folder_is_no_video(tmp_path):
+    with pytest.raises(CameraError, match=f"recording {tmp_path}: is a folder; expected a video"):
+        open_camera("recorded", {"file": str(tmp_path)}, size=SIZE, clock=FakeClock())
+
+
+def test_no_name_of_a_file_is_no_folder():
+    with pytest.raises(CameraError, match="there is no such file"):
+        open_camera("recorded", {"file": ""}, size=SIZE, clock=FakeClock())
+
+
 def test_a_recording_that_does_not_fit_the_memory_is_refused(tmp_path):
     # 1 MB holds 108 pictures of 128 x 24 x 3 bytes.
     with pytest.raises(CameraError, match=r"is longer than the 4 s that fit into camera.memory_mb = 1"):
