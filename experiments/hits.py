@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from common.console import Console
 from common.record import write_atomically
@@ -39,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Count from the command line; return the exit code."""
     options = _parser().parse_args(arguments)
     console = Console()
-    return exit_code("experiments.hits", "--out", Path(options.out), console, lambda: _count(options, console))
+    return exit_code("experiments.hits", "--out", options.out, console, lambda: _count(options, console))
 
 
 def _count(options: argparse.Namespace, console: Console) -> int:
@@ -51,7 +50,7 @@ def _count(options: argparse.Namespace, console: Console) -> int:
     choices = uninterrupted(lambda: [choose_task(name, options.preset, options.set) for name in names])
     settings = record_settings(choices, steps=steps)
     return count_grid(
-        Path(options.out),
+        options.out,
         settings,
         all_keys((choice.name for choice in choices), limits, seeds),
         tasks=", ".join(f"{choice.name} ({choice.preset})" for choice in choices),

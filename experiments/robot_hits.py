@@ -13,12 +13,12 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from common.console import Console
 from common.errors import ConfigError
+from common.options import output_folder
 from common.record import write_atomically
 from experiments.command_line import exit_code
 from experiments.grid import GridRecord
@@ -74,9 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Count from the command line; return the exit code."""
     options = _parser().parse_args(arguments)
     console = Console()
-    return exit_code(
-        "experiments.robot_hits", "--out", Path(options.out), console, lambda: _count(options, console, TABLE)
-    )
+    return exit_code("experiments.robot_hits", "--out", options.out, console, lambda: _count(options, console, TABLE))
 
 
 def _count(options: argparse.Namespace, console: Console, table: Sequence[ThesisHits]) -> int:
@@ -96,7 +94,7 @@ def _count(options: argparse.Namespace, console: Console, table: Sequence[Thesis
         return 0 if all(inside(row, limit, counts) for row, limit in limits.items()) else 1
 
     return count_grid(
-        Path(options.out),
+        options.out,
         record_settings(list(choices.values()), steps=steps),
         [hits_key(row.task, limit, seed) for seed in seeds for row, limit in limits.items()],
         tasks=", ".join(f"{row.task} {row.limit_s:g} s" for row in rows),
@@ -162,7 +160,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--workers", type=int, default=usable_cores(), metavar="N", help="processes (default: one a core, %(default)s)"
     )
-    parser.add_argument("--out", default="runs/robot_hits", metavar="DIR", help="folder (default: %(default)s)")
+    parser.add_argument(
+        "--out", type=output_folder, default="runs/robot_hits", metavar="DIR", help="folder (default: %(default)s)"
+    )
     return parser
 
 

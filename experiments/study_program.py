@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from common.console import Console
+from common.options import output_folder
 from experiments.command_line import exit_code
 from experiments.grid import Row
 from experiments.run_folders import FolderJob
@@ -99,7 +100,7 @@ class StudyProgram(Generic[ASize, AJob]):
             "--size", choices=sizes, default=next(iter(sizes)), help="of the study (default: %(default)s)"
         )
         default = f"{self.results.parent.parent.name}/{self.results.parent.name}/{self.results.name}/SIZE"
-        parser.add_argument("--out", type=Path, metavar="DIR", help=f"of the results (default: {default})")
+        parser.add_argument("--out", type=output_folder, metavar="DIR", help=f"of the results (default: {default})")
         parser.add_argument(
             "--workers",
             type=int,

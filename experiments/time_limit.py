@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -140,7 +139,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Answer from the command line; return the exit code."""
     options = _parser().parse_args(arguments)
     console = Console()
-    return exit_code("experiments.time_limit", "--out", Path(options.out), console, lambda: _answer(options, console))
+    return exit_code("experiments.time_limit", "--out", options.out, console, lambda: _answer(options, console))
 
 
 def _answer(options: argparse.Namespace, console: Console) -> int:
@@ -159,7 +158,7 @@ def _answer(options: argparse.Namespace, console: Console) -> int:
     with StopSignals() as stop:
         settings = record_settings([choice], steps=STEPS, effort=effort)
         with (
-            GridRecord(Path(options.out), settings) as record,
+            GridRecord(options.out, settings) as record,
             WorkerPool(work, settings, workers) as pool,
         ):
             console.line(f"{choice.name} ({choice.preset}): counting hits, then searching for ways to the goal")
@@ -175,7 +174,7 @@ def _answer(options: argparse.Namespace, console: Console) -> int:
         console.line("interrupted: the same command goes on from here")
         return INTERRUPTED
     text = advice(_facts(choice, effort), evidence, judge(evidence, thoroughness), thoroughness)
-    path = Path(options.out) / f"time_limit_{choice.name}.txt"
+    path = options.out / f"time_limit_{choice.name}.txt"
     write_atomically(path, text + "\n")
     console.line(f"\n{text}\n\n{path}")
     return 0

@@ -11,11 +11,11 @@ import argparse
 import csv
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from common.console import Console
+from common.options import output_folder
 from experiments.plain_sac.loop import run
 from experiments.train import Training, train
 
@@ -40,7 +40,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m experiments.plain_sac", description=__doc__)
     parser.add_argument("--seeds", type=int, default=5, choices=T_975, metavar="N", help="2 to 10 (default: 5)")
     parser.add_argument("--steps", type=int, default=5000, metavar="N", help="action cycles of a run (default: 5000)")
-    parser.add_argument("--out", type=Path, default=Path("runs/plain_sac"), metavar="DIR", help="folder of the results")
+    parser.add_argument(
+        "--out", type=output_folder, default="runs/plain_sac", metavar="DIR", help="folder of the results"
+    )
     options = parser.parse_args(arguments)
     console, rows = Console(), []
     for seed in range(options.seeds):

@@ -18,6 +18,7 @@ import numpy as np
 
 from common.config import parse_override
 from common.errors import ConfigError
+from common.options import output_folder
 from experiments.target_hits.initial_policy import initial_actions
 from experiments.target_hits.world import NotMinimumTimeError, World
 from services.robot_bridge.tasks import Task, load_task
@@ -190,7 +191,9 @@ def add_options(parser: argparse.ArgumentParser, out: str) -> None:
     parser.add_argument(
         "--workers", type=int, default=usable_cores(), metavar="N", help="processes (default: one a core, %(default)s)"
     )
-    parser.add_argument("--out", default=out, metavar="DIR", help="folder of the results (default: %(default)s)")
+    parser.add_argument(
+        "--out", type=output_folder, default=out, metavar="DIR", help="folder of the results (default: %(default)s)"
+    )
 
 
 def check_limits(limits: Sequence[int]) -> tuple[int, ...]:

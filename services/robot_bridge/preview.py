@@ -10,7 +10,6 @@ import argparse
 from collections.abc import Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from common.config import parse_override
 from common.console import Console
 from common.errors import ConfigError, RelodError
 from common.messages import TaskSpec, UInt8Array
+from common.options import output_folder
 from common.stop_signals import INTERRUPTED, StopSignals
 from services.robot_bridge.preview_pictures import contact_sheet, panels, write_picture, write_video
 from services.robot_bridge.rendering import OffscreenCamera, Window
@@ -161,7 +161,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=f"example: python -m {PROGRAM} --task ur5_visual_reacher_min_time --preview runs/preview",
     )
     parser.add_argument("--task", required=True, metavar="T", help="task id, or id=module:Class for one of your own")
-    parser.add_argument("--preview", required=True, type=Path, metavar="DIR", help="folder for video and sheet")
+    parser.add_argument("--preview", required=True, type=output_folder, metavar="DIR", help="for video and sheet")
     parser.add_argument("--preset", default="", metavar="NAME", help="of the task (default: the task's first)")
     parser.add_argument("--set", action="append", default=[], metavar="task.KEY=VALUE", help="override a setting")
     parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="of everything random (default: 0)")

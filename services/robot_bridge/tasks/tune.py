@@ -20,6 +20,7 @@ import numpy as np
 from common.console import Console
 from common.errors import ConfigError, RelodError
 from common.messages import UInt8Array
+from common.options import output_folder
 from common.record import write_atomically
 from common.stop_signals import INTERRUPTED
 from services.robot_bridge.target_detection import (
@@ -184,13 +185,11 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--image", type=Path, required=True, metavar="F", help="a picture from the robot's camera")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the drawings")
+    parser.add_argument("--out", type=output_folder, required=True, metavar="DIR", help="folder for the drawings")
     parser.add_argument(
         "--robot", choices=TARGET_COLOURS, nargs="+", default=None, help="whose ranges; without it, all robots'"
     )
-    parser.add_argument(
-        "--space", choices=[space.value for space in ColourSpace], default="hsv", help="of --low and --high (hsv)"
-    )
+    parser.add_argument("--space", choices=[space.value for space in ColourSpace], help="of --low and --high (hsv)")
     parser.add_argument("--low", metavar="A,B,C", help="lower ends of a range of your own, e.g. 30,68,0")
     parser.add_argument("--high", metavar="A,B,C", help="upper ends of a range of your own, e.g. 85,255,255")
     parser.add_argument("--spread", type=_spread, default=30, help="how far each bound is moved (30)")
@@ -206,7 +205,9 @@ def _ranges(options: argparse.Namespace) -> dict[str, ColourRange]:
         if options.robot:
             raise ConfigError("--robot and --low: expected robots' ranges or one of your own, not both")
         low, high = _colour(options.low, "--low"), _colour(options.high, "--high")
-        return {OWN_RANGE: ColourRange(ColourSpace(options.space), low, high)}
+        return {OWN_RANGE: ColourRange(ColourSpace(options.space or ColourSpace.HSV), low, high)}
+    if options.space:
+        raise ConfigError(f"--space {options.space}: expected --low and --high with it; robots' ranges have their own")
     return {robot: TARGET_COLOURS[robot] for robot in options.robot or TARGET_COLOURS}
 
 

@@ -222,6 +222,12 @@ def test_what_cannot_be_drawn_is_named(arguments, task, match, tmp_path, capsys)
     assert not list(tmp_path.iterdir())
 
 
+def test_an_empty_text_is_no_folder(capsys):
+    with pytest.raises(SystemExit):
+        run("", task="nobody")
+    assert "--preview: expected a folder, got an empty text" in capsys.readouterr().err
+
+
 def test_a_folder_that_cannot_be_written_to_is_named(opengl, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert run(tmp_path / "file", *SHORT, "--set", "task.threshold=0") == 1

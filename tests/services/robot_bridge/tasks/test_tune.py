@@ -191,6 +191,8 @@ def test_the_picture_itself_is_not_drawn_over(tmp_path, capsys, monkeypatch):
         (["--low", "1,2,3", "--high", "1,2,256"], "high = (1, 2, 256): expected H 0-179"),
         (["--low", "1,9,3", "--high", "1,2,3"], "S from 9 to 2: expected low <= high"),
         (["--low", "1,2,3", "--high", "3,4,5", "--robot", "ur5"], "expected robots' ranges or one of your own"),
+        (["--space", "bgr"], "--space bgr: expected --low and --high with it"),
+        (["--space", "hsv", "--robot", "ur5"], "--space hsv: expected --low and --high with it"),
     ],
 )
 def test_a_range_that_is_none_is_named(tmp_path, capsys, arguments, match):
@@ -201,7 +203,12 @@ def test_a_range_that_is_none_is_named(tmp_path, capsys, arguments, match):
 
 @pytest.mark.parametrize(
     ("arguments", "match"),
-    [(["--columns", "4"], "odd number from 3 to 15"), (["--spread", "0"], "from 1 to 255"), (["--robot", "x"], "ur5")],
+    [
+        (["--out", ""], "--out: expected a folder"),
+        (["--columns", "4"], "odd number from 3 to 15"),
+        (["--spread", "0"], "from 1 to 255"),
+        (["--robot", "x"], "ur5"),
+    ],
 )
 def test_a_wrong_option_is_named(tmp_path, capsys, arguments, match):
     with pytest.raises(SystemExit):
