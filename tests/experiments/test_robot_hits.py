@@ -50,6 +50,13 @@ def test_what_is_only_reported_is_always_good_enough():
     assert inside(REPORTED, 750, counts(0, 0, limit=750))
 
 
+def test_the_counts_of_other_steps_are_not_judged():
+    text = report_text({REQUIRED: 150}, counts(3, 4), 300)
+    assert "10 to 19\n" in text
+    assert text.endswith("\nthe thesis's counts and the ranges are of 20000 steps: nothing is judged")
+    assert "judged" not in report_text({REQUIRED: 150}, counts(3, 4), 20_000)
+
+
 def test_the_report_has_means_errors_and_verdicts():
     limits = {REQUIRED: 150, REPORTED: 750}
     text = report_text(limits, counts(10, 14) + counts(2, limit=750), 20_000)
@@ -70,13 +77,14 @@ def line(monkeypatch):
     def table(low, high):
         monkeypatch.setattr(robot_hits, "TABLE", (ThesisHits("line", 2.0, "20 ± 1", low, high),))
 
+    monkeypatch.setattr(robot_hits, "STEPS", 500)
     choose = robot_hits.choose_task
     monkeypatch.setattr(robot_hits, "choose_task", lambda name: choose(f"{name}={MODULE}:Line"))
     return table
 
 
-def run(out, *options):
-    return robot_hits.main(["--steps", "500", "--seeds", "2", "--workers", "1", "--out", str(out), *options])
+def run(out, *options, steps=500):
+    return robot_hits.main(["--steps", str(steps), "--seeds", "2", "--workers", "1", "--out", str(out), *options])
 
 
 def test_a_count_outside_of_its_range_ends_with_exit_code_1(line, tmp_path, capsys):
@@ -89,6 +97,12 @@ def test_a_count_outside_of_its_range_ends_with_exit_code_1(line, tmp_path, caps
     said = capsys.readouterr().out
     assert "2 of them in" in said
     assert "400 to 500: NO" in (tmp_path / "robot_hits.txt").read_text()
+
+
+def test_a_count_of_other_steps_is_never_a_failure(line, tmp_path, capsys):
+    line(400, 500)
+    assert run(tmp_path, steps=100) == 0
+    assert "are of 500 steps: nothing is judged" in capsys.readouterr().out
 
 
 def test_an_unknown_task_is_named_with_those_of_the_table(tmp_path, capsys):
