@@ -27,6 +27,8 @@ CUT_OFF_S = 2 * OVERTIME_S
 """Longest simulated time that a run's end may take, seconds: services that have heard of it late need less."""
 STANDSTILL_S = 3600.0
 """A robot that has made no step for so long, in simulated seconds, makes none any more: nobody comes to help."""
+_ANSWER = "an answer"
+"""What a robot waits for that names nothing else."""
 
 
 class ServiceNetwork(Protocol):
@@ -109,11 +111,13 @@ class InProcessRun:
         if (steps := bridge.counters().get("steps", 0.0)) != self._steps:
             self._steps, self._stepped_ns = steps, now_ns
         elif now_ns - self._stepped_ns > STANDSTILL_S * 1e9 and not self.told_to_stop:
-            waits_for = bridge.details().get("waits_for") or "an answer"
+            waits_for = bridge.details().get("waits_for") or _ANSWER
             self._standstill = (
                 f"no step for {STANDSTILL_S:.0f} s of simulated time, at {steps:.0f} steps: the robot waits for "
-                f"{waits_for}; look whether the network carries anything"
+                f"{waits_for}"
             )
+            if any(what in waits_for for what in (_ANSWER, *SERVICES)):
+                self._standstill += "; look whether the network carries anything"
             self.stop(self._standstill)
 
     def _is_overdue(self, threads: Sequence[threading.Thread]) -> bool:

@@ -14,7 +14,9 @@ from common.stop_signals import StopSignals
 from deploy.summary import read_record, summarise
 from experiments import in_process
 from experiments.train import Training, train
+from services.robot_bridge.cameras import PictureSize
 from tests.experiments.small_algorithm import SMALL_ALGORITHM
+from tests.services.robot_bridge.cameras.pictures import write_video
 
 SMALL = (
     *SMALL_ALGORITHM,
@@ -177,4 +179,16 @@ def test_a_robot_that_can_make_no_step_ends_the_run_as_a_failure(tmp_path, monke
     values = summarise(read_record(tmp_path / "run")).values
     assert (values["steps"], values["experience"]["produced"]) == (0, 0)
     assert values["notes"][0].startswith(f"the run was cut short, at 0 of 10000 steps: {reason}")
+    assert values["notes"][0].endswith("actor and replay; look whether the network carries anything")
     assert reason in (tmp_path / "run" / "logs" / "train.log").read_text(encoding="utf-8")
+
+
+def test_a_robot_that_waits_for_its_camera_does_not_blame_the_network(tmp_path, monkeypatch):
+    monkeypatch.setattr(in_process, "STANDSTILL_S", 10.0)
+    video = write_video(tmp_path / "video.avi", 30, size=PictureSize(60, 60))  # 1 s
+    camera = ("camera.name=recorded", f"camera.file={video}", "camera.loop=false")
+    task = ("task.height=60", "task.width=60")
+    training = small(tmp_path / "run", None, task="noise_frames", mode="local_only", overrides=(*SMALL, *camera, *task))
+    with pytest.raises(ServiceError, match="the robot waits for camera; see ") as caught:
+        train(training)
+    assert "network" not in str(caught.value)
