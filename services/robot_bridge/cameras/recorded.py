@@ -6,6 +6,7 @@ waits for a disk or a decoder, and what is seen when follows from the clock alon
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from common.errors import CameraError
 from common.messages import UInt8Array
 from services.robot_bridge.cameras.base import CHANNELS, Camera, CameraFrame, FrameQueue, PictureSize
 from services.robot_bridge.cameras.pictures import to_frame
+
+logger = logging.getLogger(__name__)
 
 _USUAL_RATES_HZ = (1.0, 1000.0)
 """What a file says beyond these is no rate: pictures of a slide show, or a container without a time base."""
@@ -48,12 +51,13 @@ class RecordedCamera(Camera):
     def __init__(self, settings: RecordedCameraSettings, *, size: PictureSize, clock: Clock) -> None:
         self._settings, self._clock = settings, clock
         self._name = f"recording {settings.file}"
+        self._end = f"{self._name} has ended; camera.loop = true begins it anew"
         self._pictures, rate_hz = _decode(settings, size, self._name)
         self._period_ns = 1e9 / rate_hz
         self._queue = FrameQueue(settings.capacity)
         self._shown = 0
         """Pictures that have come so far, over all rounds."""
-        self._closed = False
+        self._end_told = self._closed = False
         self._begun_ns = clock.now_ns()
         self._show_due()
 
@@ -74,7 +78,7 @@ class RecordedCamera(Camera):
     @property
     def lost(self) -> str | None:
         self._show_due()
-        return f"{self._name} has ended; camera.loop = true begins it anew" if self._ended else None
+        return self._end if self._ended else None
 
     @property
     def losses(self) -> int:
@@ -95,6 +99,9 @@ class RecordedCamera(Camera):
         """Queue what should have come by now."""
         if self._closed:
             return
+        if self._ended and not self._end_told:
+            self._end_told = True
+            logger.warning("%s", self._end)
         due = int((self._clock.now_ns() - self._begun_ns) / self._period_ns) + 1
         if not self._settings.loop:
             due = min(due, len(self._pictures))

@@ -50,7 +50,7 @@ def test_it_begins_anew_at_its_end(tmp_path):
     assert camera.lost is None
 
 
-def test_or_it_is_lost_there_as_told(tmp_path):
+def test_or_it_is_lost_there_as_told_and_says_so_once(tmp_path, caplog):
     clock = FakeClock()
     camera = opened(tmp_path, clock, count=3, rate=10.0, loop=False)
     clock.advance(0.29)
@@ -62,6 +62,7 @@ def test_or_it_is_lost_there_as_told(tmp_path):
     clock.advance(5.0)
     assert camera.take() == []
     assert camera.newest_capture_ns == 1_200_000_000  # it only grows older
+    assert [record.message for record in caplog.records] == [camera.lost]
 
 
 def test_after_a_long_time_without_a_look_the_newest_pictures_are_there(tmp_path):
