@@ -172,7 +172,8 @@ def _checked(hint: Any, value: Any, item: dataclasses.Field[Any], where: str) ->
 
 def _as_float(value: Any) -> Any:
     """A whole number as the number that is wanted; anything else as it is."""
-    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    return float(value) if whole and abs(value) <= _LARGEST_WHOLE else value
 
 
 def _range(low: float | None, high: float | None) -> str:
