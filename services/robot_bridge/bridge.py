@@ -40,6 +40,9 @@ WARM_UP_CYCLES = 1000
 REPUBLISH_NS = 1_000_000_000
 """In lockstep, a TimeStep is published again after this long without an answer."""
 WAITING_TOLD_NS = 10_000_000_000
+PROBES_UNTIL_TOLD = 10
+"""Observations to begin with that nobody answers in time, until it is said: an actor needs a moment to begin."""
+NO_ANSWER = "an answer to a first observation: if actor and link are well, frames take too long (robot_bridge.encoding)"
 """How often the log says what the robot waits for."""
 SURVIVING_COUNTS = tuple(field.name for counted in (Totals, CycleCounts) for field in fields(counted))
 """What is known of a killed bridge to the last TimeStep."""
@@ -78,6 +81,8 @@ class RobotBridge:
         self._engaged = False
         self._probing = False
         """True while an observation is out only to see whether it is answered."""
+        self._unanswered_probes = 0
+        """Such observations in a row."""
         self._needs_new_goal = True
         self._attempt_first_seq = 0
         self._in_force = self._no_command()
@@ -351,8 +356,11 @@ class RobotBridge:
             self._tell_waiting()
             self._service.pause(0.05)
             return
-        self._waits_for = None
-        logger.info("actor and replay are there: asking for a first answer")
+        self._waits_for = NO_ANSWER if self._unanswered_probes >= PROBES_UNTIL_TOLD else None
+        if self._waits_for:
+            self._tell_waiting()
+        if not self._unanswered_probes:
+            logger.info("actor and replay are there: asking for a first answer")
         # An attempt of a single TimeStep, of which no transition comes: no step is counted and the robot stands still.
         self._probing = True
         self._advance_world()
@@ -364,6 +372,9 @@ class RobotBridge:
             self._sleep_until(asked_ns + round(self._settings.stop_after * 1e9))
             self._take_actions()
         self._probing = False
+        self._unanswered_probes = 0 if self._engaged else self._unanswered_probes + 1
+        if self._engaged:
+            self._waits_for = None
         self._keeper.start(self._clock.now_ns())
 
     def _tell_waiting(self) -> None:

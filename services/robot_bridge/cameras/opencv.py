@@ -196,13 +196,20 @@ class OpenCVCamera(Camera):
         Raises:
             CameraError: none comes, or it is of a wrong size.
         """
+        begun_ns = self._clock.now_ns()
         try:
             came, picture = capture.read()
         except cv2.error as error:
             raise CameraError(f"{self._name} is lost: {error}") from error
         capture_ns = self._clock.now_ns()
         if not came:
-            within = f" within {self._settings.read_timeout:g} s" if self._settings.url else ""
-            raise CameraError(f"{self._name} is lost: expected a frame{within}, none came")
+            raise CameraError(f"{self._name} is lost: {self._why_none_came((capture_ns - begun_ns) * 1e-9)}")
         frame = to_frame(picture, self._size, resize=self._settings.resize, camera=self._name)
         self._queue.put(frame, capture_ns)
+
+    def _why_none_came(self, waited_s: float) -> str:
+        if not self._settings.url:
+            return "expected a frame, none came"
+        if waited_s < 0.9 * self._settings.read_timeout:
+            return "the stream has ended, or what came is no picture"
+        return f"expected a frame within {self._settings.read_timeout:g} s, none came"

@@ -8,14 +8,17 @@ the cycle takes what is there and never waits for a picture. It waits only where
 from __future__ import annotations
 
 import functools
+import logging
 from collections import deque
 from collections.abc import Callable
 
 import numpy as np
 
 from common.clock import Clock
-from common.errors import ServiceError
+from common.errors import RelodError, ServiceError
 from services.robot_bridge.robots.sensed_world import SensedWorld, SensorPacket
+
+logger = logging.getLogger(__name__)
 
 LONGEST_WAIT_S = 10.0
 """For the first picture of an attempt; opening OpenGL takes a large part of a second."""
@@ -66,7 +69,8 @@ class LiveWorld:
             ServiceError: what has ended it.
         """
         if self._failure is not None:
-            raise ServiceError(f"the simulated world has ended: {self._failure}") from self._failure
+            what = "" if isinstance(self._failure, RelodError) else f"{type(self._failure).__name__}: "
+            raise ServiceError(f"the simulated world has ended: {what}{self._failure}") from self._failure
 
     def place(self, goal: np.ndarray, start: np.ndarray, seed: int) -> None:
         """Place goal and robot, and wait until there is a packet and a frame of it.
@@ -122,6 +126,8 @@ class LiveWorld:
                     if self._placed == self._hurried and not self._ended:
                         self._clock.wait_until(self._world.next_due_ns, self._changed)
         except Exception as failure:
+            if not isinstance(failure, RelodError):  # A robot's own fault: whoever wrote it wants to know where.
+                logger.exception("the simulated world has ended")
             with self._changed:
                 self._failure = failure
                 self._changed.notify_all()

@@ -7,6 +7,7 @@ from common import topics
 from common.codec import decode
 from common.errors import ConfigError
 from common.messages import ActionSource, TaskSpec
+from services.robot_bridge.bridge import NO_ANSWER
 from tests.services.builders import START_NS
 from tests.services.robot_bridge.scripted import ACTOR, BRIDGE, PROBE, Scene, action_of
 
@@ -50,6 +51,25 @@ def test_a_cycle_ends_with_the_action_that_answered_its_beginning(tmp_path):
     np.testing.assert_allclose(third.proprioception, action_of(1) * 0.04 + action_of(2) * 0.03, atol=1e-7)
     assert [t.seq for t in scene.time_steps] == [0, 1, 2, 3]
     assert {t.incarnation for t in scene.time_steps} == {BRIDGE}
+
+
+def test_who_waits_in_vain_for_a_first_answer_is_told_so_until_it_comes(tmp_path, caplog):
+    scene, seen = Scene(tmp_path, answers=None, steps=2, stop_after=0.5), []
+    scene.probe_answer = None
+    for at_s in (4.7, 5.7, 25.0):
+        scene.clock.at(at_s, lambda: seen.append(scene.bridge.details()["waits_for"]))
+
+    def answer_from_now_on():
+        scene.answers = lambda time_step: 0.01
+        scene.answer(scene.time_steps[-1].seq)
+
+    scene.clock.at(25.1, answer_from_now_on)
+    scene.run()
+    assert seen == [None, NO_ANSWER, NO_ANSWER]
+    told = [record.message for record in caplog.records if NO_ANSWER in record.message]
+    assert 1 <= len(told) <= 3  # every ten seconds
+    assert scene.counts.cycles == 2
+    assert scene.bridge.details()["waits_for"] is None
 
 
 @pytest.mark.parametrize(("pacing", "started"), [("realtime", 1), ("lockstep", 0)])

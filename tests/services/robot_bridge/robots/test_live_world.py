@@ -102,6 +102,19 @@ def test_a_world_that_cannot_draw_says_so_before_anything_begins(clock):
     assert world.camera.closed == 1
 
 
+def test_a_robot_s_own_fault_is_named_and_its_place_logged(clock, caplog):
+    world = toy_world()
+
+    def fail():
+        assert clock is None
+
+    world.camera.on_capture = fail
+    with pytest.raises(ServiceError, match="the simulated world has ended: AssertionError"):
+        LiveWorld(world, clock)
+    assert "test_live_world.py" in caplog.text
+    assert "assert clock is None" in caplog.text
+
+
 def test_whoever_looks_is_told_what_has_ended_the_world(clock):
     world = toy_world()
     live = LiveWorld(world, clock)
