@@ -40,10 +40,10 @@ WARM_UP_CYCLES = 1000
 REPUBLISH_NS = 1_000_000_000
 """In lockstep, a TimeStep is published again after this long without an answer."""
 WAITING_TOLD_NS = 10_000_000_000
-PROBES_UNTIL_TOLD = 10
-"""Observations to begin with that nobody answers in time, until it is said: an actor needs a moment to begin."""
-NO_ANSWER = "an answer to a first observation: if actor and link are well, frames take too long (robot_bridge.encoding)"
 """How often the log says what the robot waits for."""
+PROBES_UNTIL_TOLD = 10
+"""First observations that nobody answers in time, until it is said: an actor may need a moment to begin."""
+NO_ANSWER = "an answer to a first observation: if actor and link are well, frames take too long (robot_bridge.encoding)"
 SURVIVING_COUNTS = tuple(field.name for counted in (Totals, CycleCounts) for field in fields(counted))
 """What is known of a killed bridge to the last TimeStep."""
 PEERS = (topics.ACTOR, topics.REPLAY)
