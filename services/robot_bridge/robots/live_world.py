@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import functools
 import logging
+import sys
+import traceback
 from collections import deque
 from collections.abc import Callable
 
@@ -16,12 +18,16 @@ import numpy as np
 
 from common.clock import Clock
 from common.errors import RelodError, ServiceError
+from services.robot_bridge.robots.lag_watch import LagWatch
 from services.robot_bridge.robots.sensed_world import SensedWorld, SensorPacket
 
 logger = logging.getLogger(__name__)
 
 LONGEST_WAIT_S = 10.0
 """For the first picture of an attempt; opening OpenGL takes a large part of a second."""
+CLOSING_TAKES_S = 1.0
+"""Longest wait for the thread to end, which it does between two packets or pictures; one that hangs is left behind."""
+_CALLS_SHOWN = 8
 _Order = Callable[[], None]
 
 
@@ -40,6 +46,7 @@ class LiveWorld:
         self._orders: deque[tuple[int, _Order]] = deque()
         self._failure: BaseException | None = None
         self._ended = False
+        self._lag_watch = LagWatch()
         self._changed = clock.condition()
         """Held for an instant only: to wait, to say that there is an order in a hurry, or that it was carried out."""
         self._hurried = self._placed = 0
@@ -63,14 +70,13 @@ class LiveWorld:
         return self._world.counters()
 
     def advance_to(self, now_ns: int) -> None:
-        """Tell that the world has ended, if it has; it goes on by itself.
+        """Tell that the world has ended, if it has, or falls behind the clock; it goes on by itself.
 
         Raises:
             ServiceError: what has ended it.
         """
-        if self._failure is not None:
-            what = "" if isinstance(self._failure, RelodError) else f"{type(self._failure).__name__}: "
-            raise ServiceError(f"the simulated world has ended: {what}{self._failure}") from self._failure
+        self._check()
+        self._tell_if_behind(now_ns)
 
     def place(self, goal: np.ndarray, start: np.ndarray, seed: int) -> None:
         """Place goal and robot, and wait until there is a packet and a frame of it.
@@ -93,7 +99,9 @@ class LiveWorld:
         self._ended = True
         with self._changed:
             self._changed.notify_all()
-        self._thread.join(LONGEST_WAIT_S)
+        self._thread.join(CLOSING_TAKES_S)
+        if self._thread.is_alive():
+            logger.error("the simulated world's thread hangs and is left behind, in\n%s", self._innermost_calls())
 
     def _carry_out_at_once(self, order: _Order) -> None:
         def carry_out() -> None:
@@ -110,9 +118,34 @@ class LiveWorld:
             while self._placed < self._hurried and self._failure is None:
                 if not self._clock.wait_until(given_ns + round(LONGEST_WAIT_S * 1e9), self._changed):
                     break
-        self.advance_to(given_ns)
+        self._check()
         if self._placed < self._hurried:
-            raise ServiceError(f"the simulated world has shown no picture for {LONGEST_WAIT_S:g} s: its thread hangs")
+            raise ServiceError(
+                f"the simulated world has shown no picture for {LONGEST_WAIT_S:g} s: it is too slow, or hangs, in\n"
+                f"{self._innermost_calls()}"
+            )
+
+    def _check(self) -> None:
+        if self._failure is not None:
+            what = "" if isinstance(self._failure, RelodError) else f"{type(self._failure).__name__}: "
+            raise ServiceError(f"the simulated world has ended: {what}{self._failure}") from self._failure
+
+    def _tell_if_behind(self, now_ns: int) -> None:
+        assert self._world.now_ns is not None, "its time began before this was built"
+        lag_ns = now_ns - self._world.now_ns - self._world.longest_rest_ns
+        if self._lag_watch.look(lag_ns, now_ns):
+            logger.warning(
+                "the simulated world is %.1f s behind the clock: %s, or its camera, takes longer for a time than that "
+                "time lasts, or hangs; now it is in\n%s",
+                lag_ns * 1e-9,
+                type(self._world.robot).__name__,
+                self._innermost_calls(),
+            )
+
+    def _innermost_calls(self) -> str:
+        """Where the world's thread is at this moment."""
+        frame = sys._current_frames().get(self._thread.ident or 0)
+        return "".join(traceback.format_stack(frame)[-_CALLS_SHOWN:]).rstrip() if frame else "(it has ended)"
 
     # ------------------------------------------------------------------ the world's thread
 
@@ -136,8 +169,11 @@ class LiveWorld:
 
     def _live_until_now(self) -> None:
         now_ns = self._clock.now_ns()
-        while self._orders:
+        while self._orders and not self._ended:
             given_ns, carry_out = self._orders.popleft()
-            self._world.advance_to(given_ns)
+            self._world.advance_to(given_ns, self._given_up)
             carry_out()
-        self._world.advance_to(now_ns)
+        self._world.advance_to(now_ns, self._given_up)
+
+    def _given_up(self) -> bool:
+        return self._ended

@@ -7,6 +7,7 @@ calls it, in real time a thread of its own (:mod:`services.robot_bridge.robots.l
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,6 +81,16 @@ class SensedWorld:
         return self._newest
 
     @property
+    def now_ns(self) -> int | None:
+        """What time it is in it; None before its time has begun."""
+        return self._now_ns
+
+    @property
+    def longest_rest_ns(self) -> int:
+        """At most this long nothing is due."""
+        return min(self._rates.sensors_ns, _SECOND_NS // self._rates.camera_hz)
+
+    @property
     def next_due_ns(self) -> int:
         """When something happens next: a packet, a frame, or a frame's end of latency."""
         release_ns = self.camera.release_ns
@@ -106,8 +117,10 @@ class SensedWorld:
         """Let the robot brake and rest."""
         self.robot.stop()
 
-    def advance_to(self, now_ns: int) -> None:
+    def advance_to(self, now_ns: int, given_up: Callable[[], bool] = lambda: False) -> None:
         """Let the world go on until ``now_ns``, through all that is due; the first call begins its time.
+
+        Once ``given_up`` returns True the world stands still before what is due next.
 
         Raises:
             ServiceError: a sensor shows what is not finite, or nothing can be drawn here.
@@ -120,6 +133,8 @@ class SensedWorld:
             self._begun_ns += forgotten_ns
             self._now_ns += forgotten_ns
         while (due_ns := self.next_due_ns) <= now_ns:
+            if given_up():
+                return
             self._move_to(due_ns)
             self.camera.release(due_ns)
             if due_ns == self._packet_due_ns:
