@@ -98,7 +98,9 @@ class ProgressReader:
 def progress_line(progress: Progress) -> str:
     """Return the progress in one line, what matters most first."""
     if not progress.steps:
-        return "starting: " + ", ".join(f"{service} {state}" for service, state in progress.states.items())
+        there = ", ".join(f"{service} {state}" for service, state in progress.states.items())
+        waiting = f"; the robot waits for {progress.waits_for}" if progress.waits_for else ""
+        return f"starting: {there}{waiting}"
     share = f"{100 * progress.steps / progress.steps_total:.0f} %" if progress.steps_total else "?"
     head = f"{progress.steps}/{progress.steps_total} {share}"
     if progress.waits_for is not None:

@@ -15,6 +15,7 @@ from deploy.run_file import REPOSITORY
 
 _LOOK_FOR_RETURN_S = 0.5
 _POLL_S = 0.02
+_KILLING_TAKES_S = 0.4
 _EARLY_END_S = 3.0
 """At the end of a run the others may leave before the bridge; after this its part says whether it is the end."""
 
@@ -25,7 +26,9 @@ class StopTimes:
 
     rest_after_s: float = 1.5
     """The bridge stops the robot and tells the others that the run is over; who runs now is told by a signal."""
-    kill_after_s: float = 3.5
+    kill_bridge_after_s: float = 3.5
+    """A bridge that runs now is killed: it hangs. The others may still wait for it, and need a moment to hand over."""
+    kill_after_s: float = 4.5
     """Who runs now is killed."""
 
 
@@ -123,12 +126,19 @@ class Supervisor:
         for child in sorted(self.children.values(), key=lambda child: child.name == LEARNER):
             if child.name != ROBOT_BRIDGE:
                 child.signal(signal.SIGINT)
+        self._wait_until(begun_s + self._stop_times.kill_bridge_after_s)
+        if bridge is not None:
+            self._kill(bridge)
         self._wait_until(begun_s + self._stop_times.kill_after_s)
         for child in self.children.values():
-            if child.alive:
-                self._report(f"{child.name} has not ended in time and is killed")
-                child.signal(signal.SIGKILL)
-        self._wait_until(begun_s + self._stop_times.kill_after_s + 0.5)
+            if child is not bridge:
+                self._kill(child)
+        self._wait_until(begun_s + self._stop_times.kill_after_s + _KILLING_TAKES_S)
+
+    def _kill(self, child: Child) -> None:
+        if child.alive:
+            self._report(f"{child.name} has not ended in time and is killed; its log: {child.console}")
+            child.signal(signal.SIGKILL)
 
     def _wait_until(self, deadline_s: float) -> None:
         while self.running and time.monotonic() < deadline_s:

@@ -15,6 +15,14 @@ def test_before_the_first_step_the_line_says_who_is_there(tmp_path: Path) -> Non
     assert line == "starting: robot_bridge running, actor -, replay -, learner starting"
 
 
+def test_before_the_first_step_the_line_says_what_the_robot_waits_for() -> None:
+    line = progress_line(Progress(RUNNING, waits_for="camera"))
+    assert (
+        line
+        == "starting: robot_bridge running, actor running, replay running, learner running; the robot waits for camera"
+    )
+
+
 def test_progress_adds_up_incarnations_and_estimates_the_rest(tmp_path: Path) -> None:
     now_s = 10.0
     reader = ProgressReader(tmp_path, 4000, now_s=lambda: now_s)
