@@ -8,6 +8,7 @@ the cycle takes what is there and never waits for a picture. It waits only where
 from __future__ import annotations
 
 import functools
+import itertools
 import logging
 import sys
 import traceback
@@ -19,7 +20,7 @@ import numpy as np
 from common.clock import Clock
 from common.errors import RelodError, ServiceError
 from services.robot_bridge.robots.lag_watch import LagWatch
-from services.robot_bridge.robots.sensed_world import SensedWorld, SensorPacket
+from services.robot_bridge.robots.sensed_world import LONGEST_GAP_NS, SensedWorld, SensorPacket
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +28,6 @@ LONGEST_WAIT_S = 10.0
 """For the first picture of an attempt; opening OpenGL takes a large part of a second."""
 CLOSING_TAKES_S = 1.0
 """Longest wait for the thread to end, which it does between two packets or pictures; one that hangs is left behind."""
-_CALLS_SHOWN = 8
 _Order = Callable[[], None]
 
 
@@ -135,8 +135,8 @@ class LiveWorld:
         lag_ns = now_ns - self._world.now_ns - self._world.longest_rest_ns
         if self._lag_watch.look(lag_ns, now_ns):
             logger.warning(
-                "the simulated world is %.1f s behind the clock: %s, or its camera, takes longer for a time than that "
-                "time lasts, or hangs; now it is in\n%s",
+                "the simulated world is %.1f s behind the clock: %s, or its camera, is slower than real time, or "
+                "hangs; just now it was in\n%s",
                 lag_ns * 1e-9,
                 type(self._world.robot).__name__,
                 self._innermost_calls(),
@@ -145,7 +145,9 @@ class LiveWorld:
     def _innermost_calls(self) -> str:
         """Where the world's thread is at this moment."""
         frame = sys._current_frames().get(self._thread.ident or 0)
-        return "".join(traceback.format_stack(frame)[-_CALLS_SHOWN:]).rstrip() if frame else "(it has ended)"
+        calls = traceback.extract_stack(frame) if frame else []
+        inner = itertools.dropwhile(lambda call: call.name != self._run.__name__, calls)
+        return "".join(traceback.format_list(inner)).rstrip()
 
     # ------------------------------------------------------------------ the world's thread
 
@@ -171,6 +173,8 @@ class LiveWorld:
         now_ns = self._clock.now_ns()
         while self._orders and not self._ended:
             given_ns, carry_out = self._orders.popleft()
+            # From one order to the next no gap is ever long, yet a world that is too slow falls behind without end.
+            self._world.forget_before(self._clock.now_ns() - LONGEST_GAP_NS)
             self._world.advance_to(given_ns, self._given_up)
             carry_out()
         self._world.advance_to(now_ns, self._given_up)

@@ -128,10 +128,7 @@ class SensedWorld:
         if self._now_ns is None:
             self._begin(now_ns)
             return
-        if now_ns - self._now_ns > LONGEST_GAP_NS:
-            forgotten_ns = now_ns - LONGEST_GAP_NS - self._now_ns
-            self._begun_ns += forgotten_ns
-            self._now_ns += forgotten_ns
+        self.forget_before(now_ns - LONGEST_GAP_NS)
         while (due_ns := self.next_due_ns) <= now_ns:
             if given_up():
                 return
@@ -142,6 +139,12 @@ class SensedWorld:
             if due_ns == self._frame_due_ns:
                 self._capture(due_ns, now_ns)
         self._move_to(now_ns)
+
+    def forget_before(self, then_ns: int) -> None:
+        """Let what time there is left until ``then_ns`` pass unnoticed: the world stands still in it."""
+        if self._now_ns is not None and self._now_ns < then_ns:
+            self._begun_ns += then_ns - self._now_ns
+            self._now_ns = then_ns
 
     def close(self) -> None:
         """Let go of what draws."""

@@ -169,6 +169,17 @@ def test_a_world_that_keeps_up_is_not_told_of(clock, caplog):
     live.close()
 
 
+def test_orders_that_pile_up_do_not_hold_a_slow_world_back(clock):
+    world = toy_world()
+    live = LiveWorld(world, clock)
+    slow_down(world, clock, 2)
+    for _ in range(250):
+        sleep_until(clock, clock.now_ns() + 40 * MS)
+        live.command(ONE)
+    assert clock.now_ns() - live.newest.capture_ns < 2_200 * MS  # It forgets what is older than 2 s.
+    live.close()
+
+
 def test_a_world_that_is_behind_ends_at_the_next_packet(clock):
     world = toy_world()
     live = LiveWorld(world, clock)
