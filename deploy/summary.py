@@ -68,6 +68,12 @@ def summarise(record: Record) -> Summary:
         notes.append(f"{service}: its clock and the bridge's jumped against each other ({jumps} x)")
     if stalls := _count(parts.total(ROBOT_BRIDGE, "camera_stalls")):
         notes.append(f"the camera stalled ({stalls} x); attempts that it befell were truncated")
+    lost = None if produced is None or persisted is None else produced - persisted
+    if lost and (unanswered := _count(parts.total(ROBOT_BRIDGE, "unanswered_probes"))):
+        notes.append(
+            f"{unanswered} first observations were not answered in time: no attempt came of them, but those that never "
+            "arrived count as lost"
+        )
     notes += run_parts.service_notes(parts)
     values = {
         "task": run.task if run else run_parts.newest_detail(parts, ROBOT_BRIDGE, "task"),
@@ -86,7 +92,7 @@ def summarise(record: Record) -> Summary:
         "experience": {
             "produced": produced,
             "persisted": persisted,
-            "lost": None if produced is None or persisted is None else produced - persisted,
+            "lost": lost,
             # Without a ring, nothing can be in it twice.
             "duplicated": record.ring.duplicated if record.ring else 0 if persisted == 0 else None,
             "resent": _sum(parts.total(ROBOT_BRIDGE, "resent"), parts.total(ACTOR, "resent")),

@@ -29,6 +29,7 @@ from services.robot_bridge.answers import Answers
 from services.robot_bridge.bookkeeping import CycleCounts, EpisodeResult, Ledger, Totals
 from services.robot_bridge.camera_watch import CameraWatch
 from services.robot_bridge.config import RobotBridgeSettings
+from services.robot_bridge.engagement import Engagement
 from services.robot_bridge.tasks.base import Task
 from services.robot_bridge.time_steps import CommandInForce, TimeStepStream, announced_spec
 from services.robot_bridge.watchdog import Watchdog
@@ -39,15 +40,8 @@ WARM_UP_CYCLES = 1000
 """``overruns_after_1000`` counts from here."""
 REPUBLISH_NS = 1_000_000_000
 """In lockstep, a TimeStep is published again after this long without an answer."""
-WAITING_TOLD_NS = 10_000_000_000
-"""How often the log says what the robot waits for."""
-PROBES_UNTIL_TOLD = 10
-"""First observations that nobody answers in time, until it is said: an actor may need a moment to begin."""
-NO_ANSWER = "an answer to a first observation: if actor and link are well, frames take too long (robot_bridge.encoding)"
 SURVIVING_COUNTS = tuple(field.name for counted in (Totals, CycleCounts) for field in fields(counted))
 """What is known of a killed bridge to the last TimeStep."""
-PEERS = (topics.ACTOR, topics.REPLAY)
-"""Without these no attempt starts: nobody would act, or nothing would be kept."""
 
 
 class RobotBridge:
@@ -78,17 +72,11 @@ class RobotBridge:
         self._answers = Answers(service, self._spec, self.counts)
         self._finished_publisher = service.transport.publisher(topics.FINISHED)
         self._last_return: float | None = None
-        self._engaged = False
-        self._probing = False
-        """True while an observation is out only to see whether it is answered."""
-        self._unanswered_probes = 0
-        """Such observations in a row."""
+        self._engagement = Engagement(service, settings, self._watchdog, self.counts, self._waits_for_camera)
         self._needs_new_goal = True
         self._attempt_first_seq = 0
         self._in_force = self._no_command()
         self._world_ns = self._clock.now_ns()
-        self._told_ns = self._clock.now_ns()
-        self._waits_for: str | None = None
         service.counters = self.counters
         service.details = self.details
         service.serve_commands(
@@ -117,7 +105,7 @@ class RobotBridge:
         self._task.advance_to(self._world_ns)
         try:
             while not self._over():
-                if self._ready():
+                if self._engagement.holds():
                     self._run_attempt()
                 else:
                     self._engage()
@@ -283,8 +271,8 @@ class RobotBridge:
 
     def _apply(self, arrived: Arrived[Action]) -> bool:
         """Let the robot obey; False for the answer that only shows that the ring is closed."""
-        self._engaged = True
-        if self._probing:
+        self._engagement.answered = True
+        if self._engagement.asking:
             return False
         clipped = np.clip(arrived.message.action, self._spec.action_low, self._spec.action_high)
         self._command(clipped, ActionSource.POLICY, arrived.message.answered_seq)
@@ -338,49 +326,26 @@ class RobotBridge:
     def _over(self) -> bool:
         return self._service.stopping.is_set() or self._ledger.totals.steps >= self._settings.steps
 
-    def _ready(self) -> bool:
-        """True while an attempt may start: actor, replay and camera are there and an answer has come."""
-        gone = any(self._service.peer_age_s(peer) > self._settings.peer_grace for peer in PEERS)
-        if self._watchdog.latched or gone or self._waits_for_camera():
-            self._engaged = False
-        return self._engaged
-
     def _engage(self) -> None:
         """Wait for actor, replay and camera, then publish one observation; its answer shows that the ring is closed."""
         self._task.stop()
-        waiting = [peer for peer in PEERS if self._service.peer_state(peer) not in ("running", "draining")]
-        waiting += ["camera"] if self._waits_for_camera() else []
-        if waiting or self._watchdog.latched:
-            reason = self._watchdog.latched or " and ".join(waiting)
-            self._waits_for = "resume" if reason in ("pause", "e_stop") else reason
-            self._tell_waiting()
+        if self._engagement.lacks():
             self._service.pause(0.05)
             return
-        self._waits_for = NO_ANSWER if self._unanswered_probes >= PROBES_UNTIL_TOLD else None
-        if self._waits_for:
-            self._tell_waiting()
-        if not self._unanswered_probes:
-            logger.info("actor and replay are there: asking for a first answer")
         # An attempt of a single TimeStep, of which no transition comes: no step is counted and the robot stands still.
-        self._probing = True
+        patience_ns = self._engagement.ask()
         self._advance_world()
         self._publish_first()
-        asked_ns = self._clock.now_ns()
-        while not self._engaged and self._clock.now_ns() - asked_ns < self._settings.stop_after * 1e9:
+        until_ns = self._clock.now_ns() + patience_ns
+        while not self._engagement.answered and self._clock.now_ns() < until_ns:
             if self._service.stopping.is_set():
                 return
-            self._sleep_until(asked_ns + round(self._settings.stop_after * 1e9))
+            self._sleep_until(until_ns)
             self._take_actions()
-        self._probing = False
-        self._unanswered_probes = 0 if self._engaged else self._unanswered_probes + 1
-        if self._engaged:
-            self._waits_for = None
+            if self._watchdog.latched:
+                break
+        self._engagement.asked()
         self._keeper.start(self._clock.now_ns())
-
-    def _tell_waiting(self) -> None:
-        if self._clock.now_ns() - self._told_ns > WAITING_TOLD_NS:
-            self._told_ns = self._clock.now_ns()
-            logger.warning("the robot waits for: %s", self._waits_for)
 
     def _finish(self, reason: str) -> None:
         finished = encode(Finished(self._service.incarnation, self.counts.produced, reason))
@@ -456,6 +421,6 @@ class RobotBridge:
             "seed": self._service.run.seed,
             "steps_total": self._settings.steps,
             "latched": self._watchdog.latched,
-            "waits_for": self._waits_for,
+            "waits_for": self._engagement.waits_for,
             "surviving_counts": self._surviving_counts.description() if self._surviving_counts else None,
         }

@@ -199,6 +199,15 @@ def test_a_clock_that_jumped_is_noted(tmp_path: Path) -> None:
     assert notes == ["actor: its clock and the bridge's jumped against each other (3 x)"]
 
 
+@pytest.mark.parametrize(("persisted", "noted"), [(5, False), (2, True)])
+def test_first_observations_that_may_have_been_lost_are_noted(tmp_path: Path, persisted: int, noted: bool) -> None:
+    write_part(tmp_path, "robot_bridge", 1, counters={"produced": 5, "unanswered_probes": 4})
+    write_part(tmp_path, "replay", 1, counters={}, persisted={"1": persisted})
+    values = summarise(read_record(tmp_path)).values
+    assert values["experience"]["lost"] == 5 - persisted
+    assert any("4 first observations were not answered in time" in note for note in values["notes"]) == noted
+
+
 def test_a_camera_that_stalled_is_noted(tmp_path: Path) -> None:
     write_run(tmp_path)
     write_part(tmp_path, "robot_bridge", 141, counters={"camera_stalls": 2})

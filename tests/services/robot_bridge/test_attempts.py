@@ -148,6 +148,41 @@ def test_no_attempt_starts_before_a_first_answer_came(tmp_path):
     assert scene.counts.cycles == 2
 
 
+def test_what_nobody_answers_is_asked_ever_more_seldom(tmp_path):
+    scene = scene_of(tmp_path, steps=1, settings={"stop_after": 0.5})
+    scene.probe_answer = None
+    scene.answers = lambda t: None if scene.clock.seconds < 30 else 0.02
+    scene.run()
+    asked_s = [0, 0.5, 1, 1.5, 2, 3, 5, 9, 17, 25, 33]
+    assert scene.published_s[: len(asked_s) + 1] == pytest.approx([*asked_s, 33.02])
+    assert scene.counts.unanswered_probes == 10
+
+
+def test_who_has_been_missing_is_asked_at_once_and_often(tmp_path):
+    scene = scene_of(tmp_path, steps=1, settings={"stop_after": 0.5})
+    scene.probe_answer = None
+    scene.answers = lambda t: None if scene.clock.seconds < 11 else 0.02
+    scene.clock.at(7.0, lambda: scene.service.peers.pop(topics.ACTOR))  # while the observation of 5 s is waited for
+    scene.clock.at(9.9, lambda: scene.service.peers.update({topics.ACTOR: "running"}))
+    scene.run()
+    before = [at for at in scene.published_s if at < 8]
+    assert before == pytest.approx([0, 0.5, 1, 1.5, 2, 3, 5])
+    back_s = scene.published_s[len(before)]
+    assert 9.9 <= back_s <= 10.0
+    assert scene.published_s[len(before) + 1 :][:2] == pytest.approx([back_s + 0.5, back_s + 1.0])
+
+
+def test_a_pause_is_noticed_while_an_answer_is_waited_for(tmp_path):
+    scene = scene_of(tmp_path, steps=1, settings={"stop_after": 0.5})
+    scene.probe_answer = None
+    scene.answers = lambda t: None if scene.clock.seconds < 12 else 0.02
+    scene.clock.at(10.0, lambda: scene.command("pause"))  # while the observation of 9 s is waited for
+    scene.clock.at(12.0, lambda: scene.command("resume"))
+    scene.run()
+    assert [at for at in scene.published_s if 9 < at < 12] == []
+    assert 12.0 <= next(at for at in scene.published_s if at > 9) <= 12.1
+
+
 def test_probes_do_not_count_as_attempts_of_the_episode(tmp_path):
     scene = scene_of(tmp_path, {3}, steps=4)
     scene.probe_answer = None

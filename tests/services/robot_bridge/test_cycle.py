@@ -7,7 +7,7 @@ from common import topics
 from common.codec import decode
 from common.errors import ConfigError
 from common.messages import ActionSource, TaskSpec
-from services.robot_bridge.bridge import NO_ANSWER
+from services.robot_bridge.engagement import NO_ANSWER
 from tests.services.builders import START_NS
 from tests.services.robot_bridge.scripted import ACTOR, BRIDGE, PROBE, Scene, action_of
 
