@@ -55,8 +55,6 @@ class CycleCounts:
     """Cycles that ended without an action of their own."""
     refused_actions: int = 0
     """Actions that were not applied."""
-    unanswered_probes: int = 0
-    """First observations, of no attempt, that nobody has answered in time."""
     produced: int = 0
     """TimeSteps published."""
 

@@ -72,7 +72,7 @@ class RobotBridge:
         self._answers = Answers(service, self._spec, self.counts)
         self._finished_publisher = service.transport.publisher(topics.FINISHED)
         self._last_return: float | None = None
-        self._engagement = Engagement(service, settings, self._watchdog, self.counts, self._waits_for_camera)
+        self._engagement = Engagement(service, settings, self._watchdog, self._waits_for_camera)
         self._needs_new_goal = True
         self._attempt_first_seq = 0
         self._in_force = self._no_command()
@@ -422,5 +422,6 @@ class RobotBridge:
             "steps_total": self._settings.steps,
             "latched": self._watchdog.latched,
             "waits_for": self._engagement.waits_for,
+            "unanswered_first_observations": self._engagement.unanswered,
             "surviving_counts": self._surviving_counts.description() if self._surviving_counts else None,
         }

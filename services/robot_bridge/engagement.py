@@ -11,7 +11,6 @@ from collections.abc import Callable
 
 from common import topics
 from common.service import Service
-from services.robot_bridge.bookkeeping import CycleCounts
 from services.robot_bridge.config import RobotBridgeSettings
 from services.robot_bridge.watchdog import Watchdog
 
@@ -37,17 +36,15 @@ class Engagement:
         service: Service,
         settings: RobotBridgeSettings,
         watchdog: Watchdog,
-        counts: CycleCounts,
         waits_for_camera: Callable[[], bool],
     ) -> None:
         """Args:
         service: knows its peers.
         settings: for how long an answer is fresh, and a peer may be silent.
         watchdog: may be latched.
-        counts: of unanswered first observations.
         waits_for_camera: True while there is no camera frame that is new enough.
         """
-        self._service, self._watchdog, self._counts = service, watchdog, counts
+        self._service, self._watchdog = service, watchdog
         self._waits_for_camera = waits_for_camera
         self._stop_after_ns = round(settings.stop_after * 1e9)
         self._peer_grace_s = settings.peer_grace
@@ -57,8 +54,9 @@ class Engagement:
         """True while an observation is out only to see whether it is answered."""
         self.waits_for: str | None = None
         """What the robot stands still for, for people."""
-        self._unanswered = 0
-        """First observations in a row."""
+        self.unanswered = 0
+        """First observations that nobody has answered in time, ever."""
+        self._unanswered_in_a_row = 0
         self._told_ns = service.clock.now_ns()
 
     def holds(self) -> bool:
@@ -74,31 +72,31 @@ class Engagement:
         missing += ["camera"] if self._waits_for_camera() else []
         if not (missing or self._watchdog.latched):
             return False
-        self._unanswered = 0  # Who comes is asked at once.
+        self._unanswered_in_a_row = 0  # Who comes is asked at once.
         self.waits_for = "resume" if self._watchdog.latched else " and ".join(missing)
         self._tell()
         return True
 
     def ask(self) -> int:
         """A first observation is published now: return for how long to wait for its answer, nanoseconds."""
-        self.waits_for = NO_ANSWER if self._unanswered >= UNANSWERED_UNTIL_TOLD else None
+        self.waits_for = NO_ANSWER if self._unanswered_in_a_row >= UNANSWERED_UNTIL_TOLD else None
         if self.waits_for:
             self._tell()
-        if not self._unanswered:
+        if not self._unanswered_in_a_row:
             logger.info("actor and replay are there: asking for a first answer")
         self.asking = True
-        patience_ns = self._stop_after_ns << max(0, self._unanswered - PATIENT_FROM + 1)
+        patience_ns = self._stop_after_ns << max(0, self._unanswered_in_a_row - PATIENT_FROM + 1)
         return max(self._stop_after_ns, min(patience_ns, LONGEST_PATIENCE_NS))
 
     def asked(self) -> None:
         """It has been answered by now, or will not be waited for any longer."""
         self.asking = False
         if self.answered:
-            self._unanswered = 0
+            self._unanswered_in_a_row = 0
             self.waits_for = None
         else:
-            self._unanswered += 1
-            self._counts.unanswered_probes += 1
+            self._unanswered_in_a_row += 1
+            self.unanswered += 1
 
     def _tell(self) -> None:
         now_ns = self._service.clock.now_ns()

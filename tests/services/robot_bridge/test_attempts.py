@@ -155,7 +155,7 @@ def test_what_nobody_answers_is_asked_ever_more_seldom(tmp_path):
     scene.run()
     asked_s = [0, 0.5, 1, 1.5, 2, 3, 5, 9, 17, 25, 33]
     assert scene.published_s[: len(asked_s) + 1] == pytest.approx([*asked_s, 33.02])
-    assert scene.counts.unanswered_probes == 10
+    assert scene.bridge.details()["unanswered_first_observations"] == 10
 
 
 def test_who_has_been_missing_is_asked_at_once_and_often(tmp_path):
