@@ -297,8 +297,12 @@ class RobotBridge:
     # ------------------------------------------------------------------ observations
 
     def _observe(self, reward: float, terminated: bool, truncated: bool) -> None:
+        reading = self._task.read()
+        if self._engagement.asking:
+            # What the camera has seen while the robot waited would only hold the question up.
+            reading = reading.without_old_frames()
         time_step = self._time_steps.publish(
-            self._task.read(),
+            reading,
             self._in_force,
             self._ledger,
             reward=reward,

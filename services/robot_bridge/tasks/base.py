@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -27,6 +27,15 @@ class SensorReading:
     """(k,): capture times on the clock given to :meth:`Task.advance_to`."""
     proprioception: Float32Array
     """(P,), physical units."""
+
+    def without_old_frames(self) -> SensorReading:
+        """The same with the newest camera frame alone, if there is any."""
+        return replace(
+            self,
+            frames=self.frames[-1:],
+            frame_ids=self.frame_ids[-1:],
+            frame_capture_ns=self.frame_capture_ns[-1:],
+        )
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,15 @@ class Run:
     """A run of a robot whose actor always answers the same, but for the cycles in which it is silent."""
 
     def __init__(
-        self, directory, steps, silent=(), name="ur5_visual_reacher_min_time", answer=TURN, where=None, **task
+        self,
+        directory,
+        steps,
+        silent=(),
+        name="ur5_visual_reacher_min_time",
+        answer=TURN,
+        where=None,
+        answered_from=0,
+        **task,
     ) -> None:
         skip_without_opengl()
         self.clock = SimulatedClock()
@@ -35,6 +43,7 @@ class Run:
         settings = RobotBridgeSettings(pacing="realtime", steps=steps, stop_after=0.5)
         self.bridge = RobotBridge(self.service, self.task, settings, Totals())
         self.actor, self.silent, self.answer, self.time_steps = Peer(self.network), silent, answer, []
+        self.answered_from = answered_from
         self.where, self.places = where or (lambda robot: None), []
         self.actor.transport.subscribe(topics.TIME_STEP, self._receive)
         self.actor.transport.subscribe(topics.FINISHED, lambda _: self._end())
@@ -47,7 +56,8 @@ class Run:
         time_step = decode(payload, TimeStep, self.task.spec.dimensions)
         self.time_steps.append(time_step)
         self.places.append(self.where(self.task.robot))
-        if time_step.step_index not in self.silent and not time_step.is_last:
+        answered = time_step.seq >= self.answered_from and time_step.step_index not in self.silent
+        if answered and not time_step.is_last:
             answer = Action(ACTOR, BRIDGE, time_step.seq, self.answer, -1.0, 3, 0, 0, 0, 0, -1)
             self.actor.send(topics.ACTION, answer)
 
@@ -115,6 +125,14 @@ def test_each_cycle_brings_the_frames_and_packets_of_its_time(tmp_path):
     # 2 s: 250 packets and 60 frames, and those from before the first attempt.
     assert 250 <= counters["sensor_packets"] <= 260
     assert 60 <= counters["camera_frames"] <= 64
+
+
+def test_what_the_camera_saw_while_the_robot_waited_does_not_travel(tmp_path):
+    run = Run(tmp_path, steps=2, answered_from=3)
+    asked = [step for step in run.time_steps if step.seq <= 3]
+    assert [len(step.frame_ids) for step in asked] == [1] * 4
+    assert np.diff([step.frame_ids[0] for step in asked[1:]]).tolist() == [15, 15]  # half a second each
+    assert all(step.published_ns - step.frame_capture_ns[0] < 34_000_000 for step in asked)
 
 
 def test_an_attempt_after_a_time_out_begins_with_a_frame_of_the_start(tmp_path):
