@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+import traceback
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ import numpy as np
 from common.codec import decode
 from common.config import load_config
 from common.console import Console
-from common.errors import ConfigError, MessageError, RelodError
+from common.errors import ConfigError, MessageError, RelodError, ServiceError
 from common.frame_encoding import FrameEncoding, encode_frames, pixels_of
 from common.frame_stack import FrameStack
 from common.messages import Float32Array, PolicyWeights, UInt8Array
@@ -213,6 +214,29 @@ def write_csv(path: Path, episodes: Sequence[EvaluatedEpisode]) -> None:
     write_atomically(path, "\n".join([header, *rows]) + "\n")
 
 
+def _evaluate(options: argparse.Namespace, stop: StopSignals, console: Console) -> int:
+    evaluation, task, weights = load_run(options.run_dir, options.config, options.seed)
+    console.line(f"{task.spec.task} ({task.spec.preset}), policy {weights.version}, {weights.updates} updates")
+    episodes: list[EvaluatedEpisode] = []
+    try:
+        while len(episodes) < options.episodes and not stop.asked:
+            episodes.append(evaluation.run_episode(len(episodes)))
+            console.status(f"{len(episodes)}/{options.episodes} episodes")
+        task.close()
+    except RelodError:
+        raise
+    except Exception as error:  # A task's own fault: whoever wrote it wants to know where.
+        traceback.print_exc()
+        raise ServiceError(f"{task.spec.task} has failed: {type(error).__name__}: {error}") from error
+    finally:
+        if episodes:
+            path = options.run_dir / "evaluation.csv"
+            write_csv(path, episodes)
+            console.line(evaluation_text(episodes))
+            console.line(str(path))
+    return INTERRUPTED if stop.asked else 0
+
+
 def _mean_and_error(values: Sequence[float]) -> str:
     mean = float(np.mean(values))
     if len(values) < 2:
@@ -232,24 +256,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"--episodes {options.episodes}: expected at least 1")
     if options.seed < 0:
         parser.error(f"--seed {options.seed}: expected at least 0")
-    console = Console()
     try:
         with StopSignals() as stop:
-            evaluation, task, weights = load_run(options.run_dir, options.config, options.seed)
-            console.line(f"{task.spec.task} ({task.spec.preset}), policy {weights.version}, {weights.updates} updates")
-            episodes: list[EvaluatedEpisode] = []
-            for number in range(options.episodes):
-                if stop.asked:
-                    break
-                episodes.append(evaluation.run_episode(number))
-                console.status(f"{len(episodes)}/{options.episodes} episodes")
-            task.close()
-            if episodes:
-                path = options.run_dir / "evaluation.csv"
-                write_csv(path, episodes)
-                console.line(evaluation_text(episodes))
-                console.line(str(path))
-            return INTERRUPTED if stop.asked else 0
+            return _evaluate(options, stop, Console())
     except RelodError as error:
         print(f"deploy.evaluate: error: {error}", file=sys.stderr)
     except OSError as error:

@@ -210,6 +210,12 @@ def _load_backend() -> type:
             atexit.register(_close_cameras)
             return context_class
     packages = ", or ".join(BACKENDS[name] for name in candidates)
+    if wanted in BACKENDS:
+        raise ServiceError(
+            f"this task has a camera, and the OpenGL backend that MUJOCO_GL names does not work here "
+            f"({'; '.join(failures)}): on Debian and Ubuntu, install {packages}, or unset MUJOCO_GL, and the first of "
+            f"{', '.join(BACKENDS)} that works is taken"
+        )
     raise ServiceError(
         f"this task has a camera, and no OpenGL backend works here ({'; '.join(failures)}): "
         f"on Debian and Ubuntu, install {packages}"

@@ -61,6 +61,19 @@ def test_a_stream_that_stalls_is_lost_and_comes_back_with_the_next_numbers(opene
     assert camera.losses >= 1
 
 
+def test_damaged_pictures_of_a_stream_are_left_out_and_leave_a_gap(opened, server, caplog):
+    # Two of twenty: two half pictures may be taken for one.
+    server.damaged = lambda number: number % 20 in (5, 6)
+    camera, frames = opened(url=server.url, read_timeout=10.0), []
+    eventually(lambda: frames.extend(camera.take()) or len(frames) >= 60, "frame 60")
+    assert (camera.losses, camera.lost) == (0, None)
+    assert camera.dropped >= 3
+    assert frames[-1].frame_id == len(frames) - 1 + camera.dropped
+    told = [record.message for record in caplog.records if "damaged" in record.message]
+    assert "pictures that are damaged are left out" in told[0]
+    assert len(told) <= 2
+
+
 def test_a_frames_time_is_between_when_it_was_sent_and_when_it_is_taken(opened, server):
     camera, frames = opened(url=server.url), []
     eventually(lambda: frames.extend(camera.take()) or len(frames) >= 20, "frame 20")
