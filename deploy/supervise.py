@@ -193,4 +193,4 @@ class Supervisor:
 
 
 def _how_to_return(child: Child) -> list[str]:
-    return [f"  the others go on; start it again, in {REPOSITORY}:", f"  {child.service.command_line()}"]
+    return [f"  the others go on until Ctrl-C; start it again, in {REPOSITORY}:", f"  {child.service.command_line()}"]
