@@ -143,11 +143,14 @@ class LiveWorld:
             )
 
     def _innermost_calls(self) -> str:
-        """Where the world's thread is at this moment."""
+        """Where the world's thread is at this moment, as in a traceback; without the lines, which are on the disk."""
         frame = sys._current_frames().get(self._thread.ident or 0)
-        calls = traceback.extract_stack(frame) if frame else []
-        inner = itertools.dropwhile(lambda call: call.name != self._run.__name__, calls)
-        return "".join(traceback.format_list(inner)).rstrip()
+        if frame is None:
+            return "  (it has ended)"
+        calls = ((at.f_code, line) for at, line in traceback.walk_stack(frame))
+        inner = itertools.takewhile(lambda call: call[0].co_qualname != self._run.__qualname__, calls)
+        places = [f'  File "{code.co_filename}", line {line}, in {code.co_qualname}' for code, line in inner]
+        return "\n".join(reversed(places))
 
     # ------------------------------------------------------------------ the world's thread
 
