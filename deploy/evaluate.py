@@ -223,17 +223,19 @@ def _evaluate(options: argparse.Namespace, stop: StopSignals, console: Console) 
             episodes.append(evaluation.run_episode(len(episodes)))
             console.status(f"{len(episodes)}/{options.episodes} episodes")
         task.close()
-    except RelodError:
-        raise
-    except Exception as error:  # A task's own fault: whoever wrote it wants to know where.
-        traceback.print_exc()
-        raise ServiceError(f"{task.spec.task} has failed: {type(error).__name__}: {error}") from error
-    finally:
+    except Exception as error:
         if episodes:
-            path = options.run_dir / "evaluation.csv"
-            write_csv(path, episodes)
             console.line(evaluation_text(episodes))
-            console.line(str(path))
+        if isinstance(error, RelodError):
+            raise
+        traceback.print_exc()  # Whoever wrote the task wants to know where.
+        what = f"{task.spec.task} has failed after {len(episodes)} episodes"
+        raise ServiceError(f"{what}: {type(error).__name__}: {error}") from error
+    if episodes:
+        path = options.run_dir / "evaluation.csv"
+        write_csv(path, episodes)
+        console.line(evaluation_text(episodes))
+        console.line(str(path))
     return INTERRUPTED if stop.asked else 0
 
 

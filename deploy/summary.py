@@ -69,7 +69,8 @@ def summarise(record: Record) -> Summary:
     if stalls := _count(parts.total(ROBOT_BRIDGE, "camera_stalls")):
         notes.append(f"the camera stalled ({stalls} x); attempts that it befell were truncated")
     lost = None if produced is None or persisted is None else produced - persisted
-    if lost and (unanswered := run_parts.newest_detail(parts, ROBOT_BRIDGE, "unanswered_first_observations")):
+    unanswered = sum(part.get("unanswered_first_observations") or 0 for part in parts.of(ROBOT_BRIDGE))
+    if lost and unanswered:
         notes.append(
             f"{unanswered} first observations were not answered in time: no attempt came of them, but those that never "
             "arrived count as lost"

@@ -26,10 +26,8 @@ class StopTimes:
 
     rest_after_s: float = 1.5
     """The bridge stops the robot and tells the others that the run is over; who runs now is told by a signal."""
-    kill_bridge_after_s: float = 3.5
-    """A bridge that runs now is killed: it hangs. The others may still wait for it, and need a moment to hand over."""
     kill_after_s: float = 4.5
-    """Who runs now is killed."""
+    """Who runs now is killed. Whoever waits for one that hangs has given up by then, and closed its record."""
 
 
 class Supervisor:
@@ -126,19 +124,12 @@ class Supervisor:
         for child in sorted(self.children.values(), key=lambda child: child.name == LEARNER):
             if child.name != ROBOT_BRIDGE:
                 child.signal(signal.SIGINT)
-        self._wait_until(begun_s + self._stop_times.kill_bridge_after_s)
-        if bridge is not None:
-            self._kill(bridge)
         self._wait_until(begun_s + self._stop_times.kill_after_s)
         for child in self.children.values():
-            if child is not bridge:
-                self._kill(child)
+            if child.alive:
+                self._report(f"{child.name} has not ended in time and is killed; its log: {child.console}")
+                child.signal(signal.SIGKILL)
         self._wait_until(begun_s + self._stop_times.kill_after_s + _KILLING_TAKES_S)
-
-    def _kill(self, child: Child) -> None:
-        if child.alive:
-            self._report(f"{child.name} has not ended in time and is killed; its log: {child.console}")
-            child.signal(signal.SIGKILL)
 
     def _wait_until(self, deadline_s: float) -> None:
         while self.running and time.monotonic() < deadline_s:

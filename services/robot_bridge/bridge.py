@@ -333,21 +333,19 @@ class RobotBridge:
     def _engage(self) -> None:
         """Wait for actor, replay and camera, then publish one observation; its answer shows that the ring is closed."""
         self._task.stop()
-        if self._engagement.lacks():
+        if not self._engagement.may_ask():
             self._service.pause(0.05)
             return
         # An attempt of a single TimeStep, of which no transition comes: no step is counted and the robot stands still.
-        patience_ns = self._engagement.ask()
+        self._engagement.ask()
         self._advance_world()
         self._publish_first()
-        until_ns = self._clock.now_ns() + patience_ns
+        until_ns = self._clock.now_ns() + round(self._settings.stop_after * 1e9)
         while not self._engagement.answered and self._clock.now_ns() < until_ns:
             if self._service.stopping.is_set():
                 return
             self._sleep_until(until_ns)
             self._take_actions()
-            if self._watchdog.latched:
-                break
         self._engagement.asked()
         self._keeper.start(self._clock.now_ns())
 

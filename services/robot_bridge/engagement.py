@@ -18,9 +18,10 @@ logger = logging.getLogger(__name__)
 
 PEERS = (topics.ACTOR, topics.REPLAY)
 """Without these no attempt starts: nobody would act, or nothing would be kept."""
-PATIENT_FROM = 4
-"""After this many unanswered first observations in a row each is waited for twice as long as the one before."""
-LONGEST_PATIENCE_NS = 8_000_000_000
+ASKED_AT_ONCE = 4
+"""So many unanswered first observations in a row are followed by the next one at once, each later one after twice the
+time of the one before it."""
+LONGEST_PERIOD_NS = 8_000_000_000
 UNANSWERED_UNTIL_TOLD = 6
 """First observations in a row that nobody answers in time, until it is said: an actor may need a moment to begin."""
 NO_ANSWER = "an answer to a first observation: if actor and link are well, frames take too long (robot_bridge.encoding)"
@@ -55,8 +56,9 @@ class Engagement:
         self.waits_for: str | None = None
         """What the robot stands still for, for people."""
         self.unanswered = 0
-        """First observations that nobody has answered in time, ever."""
+        """First observations of this bridge that nobody has answered in time."""
         self._unanswered_in_a_row = 0
+        self._ask_again_ns = 0
         self._told_ns = service.clock.now_ns()
 
     def holds(self) -> bool:
@@ -66,40 +68,44 @@ class Engagement:
             self.answered = False
         return self.answered
 
-    def lacks(self) -> bool:
-        """True while asking would be of no use: somebody is missing, or the robot may not move. Says so."""
+    def may_ask(self) -> bool:
+        """True if a first observation is worth while now; says what is missing if it is not."""
+        return not self._lacks() and self._service.clock.now_ns() >= self._ask_again_ns
+
+    def _lacks(self) -> bool:
         missing = [peer for peer in PEERS if self._service.peer_state(peer) not in ("running", "draining")]
         missing += ["camera"] if self._waits_for_camera() else []
         if not (missing or self._watchdog.latched):
             return False
-        self._unanswered_in_a_row = 0  # Who comes is asked at once.
+        self._unanswered_in_a_row = self._ask_again_ns = 0  # Who comes is asked at once.
         self.waits_for = "resume" if self._watchdog.latched else " and ".join(missing)
         self._tell()
         return True
 
-    def ask(self) -> int:
-        """A first observation is published now: return for how long to wait for its answer, nanoseconds."""
-        self.waits_for = NO_ANSWER if self._unanswered_in_a_row >= UNANSWERED_UNTIL_TOLD else None
-        if self.waits_for:
-            self._tell()
+    def ask(self) -> None:
+        """A first observation is published now."""
         if not self._unanswered_in_a_row:
             logger.info("actor and replay are there: asking for a first answer")
+        self.waits_for = NO_ANSWER if self._unanswered_in_a_row >= UNANSWERED_UNTIL_TOLD else None
+        if self.waits_for:
+            self._tell(at_once=self._unanswered_in_a_row == UNANSWERED_UNTIL_TOLD)
         self.asking = True
-        patience_ns = self._stop_after_ns << max(0, self._unanswered_in_a_row - PATIENT_FROM + 1)
-        return max(self._stop_after_ns, min(patience_ns, LONGEST_PATIENCE_NS))
 
     def asked(self) -> None:
-        """It has been answered by now, or will not be waited for any longer."""
+        """It has been answered by now, or an answer would come too late."""
         self.asking = False
         if self.answered:
             self._unanswered_in_a_row = 0
             self.waits_for = None
-        else:
-            self._unanswered_in_a_row += 1
+        elif not self._watchdog.latched:  # which had cut the wait short
             self.unanswered += 1
+            self._unanswered_in_a_row += 1
+            doublings = max(0, self._unanswered_in_a_row - ASKED_AT_ONCE)
+            period_ns = min(self._stop_after_ns << doublings, LONGEST_PERIOD_NS)
+            self._ask_again_ns = self._service.clock.now_ns() + max(0, period_ns - self._stop_after_ns)
 
-    def _tell(self) -> None:
+    def _tell(self, at_once: bool = False) -> None:
         now_ns = self._service.clock.now_ns()
-        if now_ns - self._told_ns > WAITING_TOLD_NS:
+        if at_once or now_ns - self._told_ns > WAITING_TOLD_NS:
             self._told_ns = now_ns
             logger.warning("the robot waits for: %s", self.waits_for)

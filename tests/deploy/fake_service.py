@@ -1,8 +1,8 @@
 """A stand-in for a service: ``fake_service.py NAME RUN_DIR BEHAVIOUR``. Only the standard library, so it starts fast.
 
 It writes a part, as services do, and lives until the bridge says that the run is over (the file ``finished``; with
-``hears`` the mirrored part of a bridge on another computer does as well), or until a signal; ``patient`` waits after it
-until there is no bridge any more. What ends it is a line of ``ends.log``.
+``hears`` the mirrored part of a bridge on another computer does as well), or until a signal. What ends it is a line of
+``ends.log``.
 """
 
 import json
@@ -46,11 +46,8 @@ def end(reason: str) -> None:
 
 
 signal.signal(signal.SIGTERM, lambda *_: end("SIGTERM"))
-told = False
 if behaviour == "stubborn":
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-elif behaviour == "patient":
-    signal.signal(signal.SIGINT, lambda *_: globals().update(told=True))
 else:
     signal.signal(signal.SIGINT, lambda *_: end("SIGINT"))
 if behaviour == "cannot start":
@@ -77,14 +74,7 @@ def bridge_has_stopped_there() -> bool:
     return any(json.loads(part.read_text(encoding="utf-8"))["state"] == "stopped" for part in parts)
 
 
-def bridge_is_gone() -> bool:
-    (part,) = (run_dir / "parts").glob("robot_bridge-*.json")
-    return not Path(f"/proc/{json.loads(part.read_text(encoding='utf-8'))['pid']}").exists()
-
-
 while True:
-    if told and bridge_is_gone():
-        end("bridge gone")
     if behaviour != "deaf" and (run_dir / "finished").exists():
         end("finished")
     if behaviour == "hears" and bridge_has_stopped_there():

@@ -198,7 +198,7 @@ def test_a_damaged_policy_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "PolicyWeights" in capsys.readouterr().err
 
 
-def test_a_task_that_fails_is_named_and_the_episodes_before_are_kept(
+def test_a_task_that_fails_is_named_and_the_episodes_before_are_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_run(tmp_path)
@@ -212,10 +212,12 @@ def test_a_task_that_fails_is_named_and_the_episodes_before_are_kept(
     monkeypatch.setattr(Evaluation, "run_episode", fail)
     assert evaluate.main([str(tmp_path), "--episodes", "5"]) == 1
     said = capsys.readouterr()
-    assert said.err.endswith("deploy.evaluate: error: dot_reacher has failed: ZeroDivisionError: nowhere to go\n")
+    assert said.err.endswith(
+        "deploy.evaluate: error: dot_reacher has failed after 2 episodes: ZeroDivisionError: nowhere to go\n"
+    )
     assert "in fail" in said.err  # where
-    assert len((tmp_path / "evaluation.csv").read_text().splitlines()) == 1 + 2
     assert "episodes   2, " in said.out
+    assert not (tmp_path / "evaluation.csv").exists()  # That of an earlier evaluation stays.
 
 
 class Remembering:

@@ -201,7 +201,8 @@ def test_a_clock_that_jumped_is_noted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("persisted", "noted"), [(5, False), (2, True)])
 def test_first_observations_that_may_have_been_lost_are_noted(tmp_path: Path, persisted: int, noted: bool) -> None:
-    write_part(tmp_path, "robot_bridge", 1, counters={"produced": 5}, unanswered_first_observations=4)
+    write_part(tmp_path, "robot_bridge", 1, counters={"produced": 5}, unanswered_first_observations=3)
+    write_part(tmp_path, "robot_bridge", 2, counters={"produced": 0}, unanswered_first_observations=1)
     write_part(tmp_path, "replay", 1, counters={}, persisted={"1": persisted})
     values = summarise(read_record(tmp_path)).values
     assert values["experience"]["lost"] == 5 - persisted

@@ -71,7 +71,7 @@ class Camera(ABC):
     @property
     @abstractmethod
     def dropped(self) -> int:
-        """Frames that nobody took in time, or that came damaged."""
+        """Frames that nobody took in time, or that could not be decoded."""
 
     @property
     @abstractmethod
@@ -96,16 +96,14 @@ class FrameQueue:
         self._lock = threading.Lock()
         self._next_frame_id = 0
         self.dropped = 0
-        """Frames that had to make room for newer ones, or were missed."""
+        """Frames that had to make room for newer ones."""
         self.newest_capture_ns = 0
         """Of the newest frame that came; 0 before the first."""
 
-    def put(self, frame: UInt8Array, capture_ns: int, missed: int = 0) -> None:
-        """Add a frame, and the numbers of ``missed`` ones before it; the oldest goes if there is no room."""
+    def put(self, frame: UInt8Array, capture_ns: int) -> None:
+        """Add a frame; the oldest goes if there is no room."""
         frame.flags.writeable = False
         with self._lock:
-            self._next_frame_id += missed
-            self.dropped += missed
             self.dropped += len(self._frames) == self._frames.maxlen
             self._frames.append(CameraFrame(frame, self._next_frame_id, capture_ns))
             self._next_frame_id += 1

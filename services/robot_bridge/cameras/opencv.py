@@ -22,7 +22,7 @@ from services.robot_bridge.cameras.pictures import to_frame
 logger = logging.getLogger(__name__)
 
 NO_DEVICE = -1
-DAMAGED_IN_A_ROW = 3
+UNDECODABLE_IN_A_ROW = 3
 """So many pictures of a stream that cannot be decoded are left out; with the next one it has ended, for all we know."""
 _CLOSING_TAKES_S = 2.0
 """How much longer than opening or reading the thread may take to end."""
@@ -76,7 +76,7 @@ class OpenCVCamera(Camera):
         self._closed = False
         self._lost: str | None = None
         self._losses = 0
-        self._damaged = 0
+        self._undecodable = 0
         # Here and not in the thread: whoever names a camera that is not there shall hear it at once.
         capture = self._open()
         self._thread = clock.thread(lambda: self._run(capture), "camera")
@@ -91,7 +91,7 @@ class OpenCVCamera(Camera):
 
     @property
     def dropped(self) -> int:
-        return self._queue.dropped
+        return self._queue.dropped + self._undecodable
 
     @property
     def lost(self) -> str | None:
@@ -194,12 +194,12 @@ class OpenCVCamera(Camera):
         return capture
 
     def _read(self, capture: Any) -> None:
-        """Wait for the next frame and queue it; pictures of a stream that are damaged are left out.
+        """Wait for the next frame and queue it; pictures of a stream that cannot be decoded are left out.
 
         Raises:
             CameraError: none comes, or it is of a wrong size.
         """
-        for damaged in range(DAMAGED_IN_A_ROW + 1):
+        for undecodable in range(UNDECODABLE_IN_A_ROW + 1):
             begun_ns = self._clock.now_ns()
             try:
                 came, picture = capture.read()
@@ -208,19 +208,20 @@ class OpenCVCamera(Camera):
             capture_ns = self._clock.now_ns()
             if came:
                 frame = to_frame(picture, self._size, resize=self._settings.resize, camera=self._name)
-                self._queue.put(frame, capture_ns, missed=damaged)
-                self._tell_damaged(damaged)
+                self._queue.put(frame, capture_ns)
+                self._count_undecodable(undecodable)
                 return
             if not self._settings.url:
                 raise CameraError(f"{self._name} is lost: expected a frame, none came")
-            if (capture_ns - begun_ns) * 1e-9 > 0.9 * self._settings.read_timeout:
+            if (capture_ns - begun_ns) * 1e-9 >= 0.9 * self._settings.read_timeout:
                 timeout_s = self._settings.read_timeout
                 raise CameraError(f"{self._name} is lost: expected a frame within {timeout_s:g} s, none came")
             if self._closed:
                 return
         raise CameraError(f"{self._name} is lost: the stream has ended, or what came is no picture")
 
-    def _tell_damaged(self, count: int) -> None:
-        before, self._damaged = self._damaged, self._damaged + count
-        if len(str(self._damaged)) > len(str(before)) or before == 0 < count:
-            logger.warning("%s: pictures that are damaged are left out, %d so far", self._name, self._damaged)
+    def _count_undecodable(self, count: int) -> None:
+        before, self._undecodable = self._undecodable, self._undecodable + count
+        # With the first, the tenth, the hundredth: a bad link must not fill the log.
+        if count and (before == 0 or len(str(self._undecodable)) > len(str(before))):
+            logger.warning("%s: pictures that cannot be decoded are left out, %d so far", self._name, self._undecodable)

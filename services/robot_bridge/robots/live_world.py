@@ -19,14 +19,14 @@ import numpy as np
 
 from common.clock import Clock
 from common.errors import RelodError, ServiceError
-from services.robot_bridge.robots.lag_watch import LagWatch
+from services.robot_bridge.robots.lag_watch import LAG_NS, LagWatch
 from services.robot_bridge.robots.sensed_world import LONGEST_GAP_NS, SensedWorld, SensorPacket
 
 logger = logging.getLogger(__name__)
 
 LONGEST_WAIT_S = 10.0
 """For the first picture of an attempt; opening OpenGL takes a large part of a second."""
-CLOSING_TAKES_S = 1.0
+CLOSING_TAKES_S = 0.5
 """Longest wait for the thread to end, which it does between two packets or pictures; one that hangs is left behind."""
 _Order = Callable[[], None]
 
@@ -176,11 +176,18 @@ class LiveWorld:
         now_ns = self._clock.now_ns()
         while self._orders and not self._ended:
             given_ns, carry_out = self._orders.popleft()
-            # From one order to the next no gap is ever long, yet a world that is too slow falls behind without end.
-            self._world.forget_before(self._clock.now_ns() - LONGEST_GAP_NS)
-            self._world.advance_to(given_ns, self._given_up)
+            self._live_until(given_ns)
             carry_out()
-        self._world.advance_to(now_ns, self._given_up)
+        self._live_until(now_ns)
 
-    def _given_up(self) -> bool:
-        return self._ended
+    def _live_until(self, then_ns: int) -> None:
+        """From what is due to what is due next, however long the world takes for it."""
+        while not self._ended:
+            clock_ns = self._clock.now_ns()
+            # What was before a placement that is waited for need not be made up.
+            forgiven_ns = LONGEST_GAP_NS if self._placed == self._hurried else LAG_NS
+            self._world.forget_before(clock_ns - forgiven_ns)
+            due_ns = min(self._world.next_due_ns, then_ns)
+            self._world.advance_to(due_ns, clock_ns)
+            if due_ns == then_ns:
+                return

@@ -7,7 +7,6 @@ calls it, in real time a thread of its own (:mod:`services.robot_bridge.robots.l
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,10 +116,12 @@ class SensedWorld:
         """Let the robot brake and rest."""
         self.robot.stop()
 
-    def advance_to(self, now_ns: int, given_up: Callable[[], bool] = lambda: False) -> None:
+    def advance_to(self, now_ns: int, clock_ns: int | None = None) -> None:
         """Let the world go on until ``now_ns``, through all that is due; the first call begins its time.
 
-        Once ``given_up`` returns True the world stands still before what is due next.
+        Args:
+            now_ns: until when.
+            clock_ns: what time it is already, where the world goes on in portions to catch up.
 
         Raises:
             ServiceError: a sensor shows what is not finite, or nothing can be drawn here.
@@ -130,14 +131,12 @@ class SensedWorld:
             return
         self.forget_before(now_ns - LONGEST_GAP_NS)
         while (due_ns := self.next_due_ns) <= now_ns:
-            if given_up():
-                return
             self._move_to(due_ns)
             self.camera.release(due_ns)
             if due_ns == self._packet_due_ns:
                 self._sense(due_ns)
             if due_ns == self._frame_due_ns:
-                self._capture(due_ns, now_ns)
+                self._capture(due_ns, now_ns if clock_ns is None else clock_ns)
         self._move_to(now_ns)
 
     def forget_before(self, then_ns: int) -> None:
@@ -184,10 +183,10 @@ class SensedWorld:
         self._packets += 1
         self.packets += 1
 
-    def _capture(self, due_ns: int, now_ns: int) -> None:
+    def _capture(self, due_ns: int, clock_ns: int) -> None:
         self._frames += 1
         # What would be pushed out of the buffer before anyone can take it is not worth drawing.
-        if now_ns - due_ns >= BUFFERED_FRAMES * _SECOND_NS // self._rates.camera_hz:
+        if clock_ns - due_ns >= BUFFERED_FRAMES * _SECOND_NS // self._rates.camera_hz:
             self.camera.miss(1)
         else:
             self.camera.capture(self.robot.data, due_ns)

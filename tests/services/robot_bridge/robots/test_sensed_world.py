@@ -184,10 +184,3 @@ def test_a_sensor_that_gives_no_number_is_named(value):
     world.robot.offset = value
     with pytest.raises(ServiceError, match=rf"a sensor of Cart gave \[{value}\]: expected finite numbers"):
         world.advance_to(8 * MS)
-
-
-def test_a_world_that_is_given_up_stands_still_before_what_is_due_next():
-    world, looks = toy_world(), iter([False, False, True])
-    world.advance_to(0)
-    world.advance_to(100 * MS, lambda: next(looks))
-    assert world.now_ns == 16 * MS  # two packets
