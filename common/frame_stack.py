@@ -1,9 +1,9 @@
 """The one rule that turns new camera frames into the stack of an observation; used by actor and replay.
 
 A camera has its own rate, so a TimeStep brings 0, 1, 2 or more new frames, each with an id: consecutive within an
-attempt, rising within a bridge incarnation. The stack of a TimeStep is its newest frame and the S - 1 before it; ids before the
-first frame of the attempt are replaced by that first frame. The rule is stated on ids alone, so resent, late and
-lost TimeSteps change nothing but which frames are there.
+attempt, rising within a bridge incarnation. The stack of a TimeStep is its newest frame and the S - 1 before it; ids
+before the first frame of the attempt are replaced by that first frame. The rule is stated on ids alone, so resent, late
+and lost TimeSteps change nothing but which frames are there.
 """
 
 from __future__ import annotations
