@@ -75,6 +75,8 @@ class Service:
         """Why the service has to end with exit code 1."""
         self.note: str | None = None
         """What people should know of this service's end that is no failure."""
+        self.on_stop: Callable[[], None] = lambda: None
+        """Called, by any thread, once the service is asked to stop; it must not wait."""
         self.wake = self.clock.condition()
         """Notified when a message has arrived or the service is asked to stop."""
         self.state = "starting"
@@ -126,6 +128,7 @@ class Service:
         if not self.stopping.is_set():
             logger.info("stopping: %s", reason)
             self.stopping.set()
+            self.on_stop()
         with self.wake:
             self.wake.notify_all()
 

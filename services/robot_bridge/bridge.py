@@ -79,6 +79,7 @@ class RobotBridge:
         self._world_ns = self._clock.now_ns()
         service.counters = self.counters
         service.details = self.details
+        service.on_stop = task.give_up
         service.serve_commands(
             {"pause": lambda: self._latch("pause"), "e_stop": lambda: self._latch("e_stop"), "resume": self._resume}
         )
@@ -129,7 +130,8 @@ class RobotBridge:
             self._needs_new_goal = False
         else:
             self._task.begin_attempt()
-        self._publish_first()
+        if not self._service.stopping.is_set():  # Then the robot may not be where the attempt begins.
+            self._publish_first()
 
     def _publish_first(self) -> None:
         """Publish the first TimeStep of an attempt."""

@@ -15,8 +15,6 @@ class CameraWatch:
 
     def __init__(self, stall_after_ns: int) -> None:
         self._stall_after_ns = stall_after_ns
-        self._stalled_ns = 0
-        """Capture time of the frame at which the running stall began."""
         self.stalled = False
         """What the last :meth:`look` returned."""
         self.stalls = 0
@@ -32,11 +30,8 @@ class CameraWatch:
         stalled = newest_frame_ns is not None and now_ns - newest_frame_ns > self._stall_after_ns
         if newest_frame_ns is not None and stalled and not self.stalled:
             self.stalls += 1
-            self._stalled_ns = newest_frame_ns
             logger.warning("the camera has stalled: its newest frame is %.2f s old", (now_ns - newest_frame_ns) / 1e9)
         elif newest_frame_ns is not None and self.stalled and not stalled:
-            logger.warning(
-                "the camera is back after %.2f s without a frame", (newest_frame_ns - self._stalled_ns) / 1e9
-            )
+            logger.warning("the camera is back: its newest frame is %.2f s old", (now_ns - newest_frame_ns) / 1e9)
         self.stalled = stalled
         return stalled

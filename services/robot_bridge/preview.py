@@ -133,7 +133,7 @@ def _label(moment: Moment) -> str:
     text = f"{moment.time_s:.2f} s"
     if moment.mask is not None:
         text += f"   target: {100 * float(moment.mask.mean()):.1f} % of the image"
-    return text + "   goal" * moment.at_goal
+    return text + ("   goal" if moment.at_goal else "")
 
 
 def _task(options: argparse.Namespace) -> RobotTask:

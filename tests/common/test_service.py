@@ -375,6 +375,14 @@ def test_what_is_no_command_is_answered_with_the_reason(scene, payload):
     assert not actor.stopping.is_set()
 
 
+def test_whoever_has_to_be_told_of_a_stop_is_told_once(scene):
+    actor, told = scene.service("actor"), []
+    actor.on_stop = lambda: told.append(actor.stopping.is_set())
+    actor.stop("SIGINT")
+    actor.stop("once more")
+    assert told == [True]
+
+
 def test_stopping_wakes_the_loop(scene):
     actor = scene.service("actor")
     with running(actor.stop, "a test") as results, actor.wake:

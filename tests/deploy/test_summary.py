@@ -200,6 +200,16 @@ def test_a_clock_that_jumped_is_noted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("persisted", "noted"), [(5, False), (2, True)])
+def test_what_a_run_that_was_ended_lost_on_its_way_is_noted(tmp_path: Path, persisted: int, noted: bool) -> None:
+    replace(RUN, steps=10, ended_early="interrupted").write(tmp_path)
+    write_part(tmp_path, "robot_bridge", 1, counters={"produced": 5, "steps": 10})
+    write_part(tmp_path, "replay", 1, counters={}, persisted={"1": persisted})
+    notes = summarise(read_record(tmp_path)).values["notes"]
+    said = "the run was ended (interrupted): what was still on its way by then counts as lost"
+    assert (said in notes) == noted
+
+
+@pytest.mark.parametrize(("persisted", "noted"), [(5, False), (2, True)])
 def test_first_observations_that_may_have_been_lost_are_noted(tmp_path: Path, persisted: int, noted: bool) -> None:
     write_part(tmp_path, "robot_bridge", 1, counters={"produced": 5}, unanswered_first_observations=3)
     write_part(tmp_path, "robot_bridge", 2, counters={"produced": 0}, unanswered_first_observations=1)

@@ -140,8 +140,11 @@ def _decode(settings: RecordedCameraSettings, size: PictureSize, name: str) -> t
                     f"{settings.memory_mb:g}; cut it, or allow more"
                 )
             pictures.append(to_frame(picture, size, resize=settings.resize, camera=name))
+        said = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     finally:
         capture.release()
     if not pictures:
         raise CameraError(f"{name}: expected a video with pictures in it, found none")
+    if len(pictures) < 0.9 * said:  # What a file says is an estimate in some formats.
+        logger.warning("%s: of %d pictures %d can be decoded: it is damaged, or cut short", name, said, len(pictures))
     return pictures, rate_hz

@@ -26,6 +26,8 @@ logger = logging.getLogger(__name__)
 
 LONGEST_WAIT_S = 10.0
 """For the first picture of an attempt; opening OpenGL takes a large part of a second."""
+LONG_WAIT_S = 2.0
+"""After this the log says what it waits for."""
 CLOSING_TAKES_S = 0.5
 """Longest wait for the thread to end, which it does between two packets or pictures; one that hangs is left behind."""
 _Order = Callable[[], None]
@@ -45,7 +47,7 @@ class LiveWorld:
         # Appended to by the cycle's thread, taken from by the world's: a deque needs no lock for that.
         self._orders: deque[tuple[int, _Order]] = deque()
         self._failure: BaseException | None = None
-        self._ended = False
+        self._ended = self._given_up = False
         self._lag_watch = LagWatch()
         self._changed = clock.condition()
         """Held for an instant only: to wait, to say that there is an order in a hurry, or that it was carried out."""
@@ -84,7 +86,7 @@ class LiveWorld:
         Raises:
             ServiceError: there is none after :data:`LONGEST_WAIT_S`, or the world has ended.
         """
-        self._carry_out_at_once(functools.partial(self._world.place, goal, start, seed))
+        self._carry_out_at_once(functools.partial(self._world.place, goal, start, seed, self._clock.now_ns))
 
     def command(self, action: np.ndarray) -> None:
         """Let the robot obey ``action`` (A,) from now on."""
@@ -93,6 +95,12 @@ class LiveWorld:
     def stop(self) -> None:
         """Let the robot brake and rest."""
         self._orders.append((self._clock.now_ns(), self._world.stop))
+
+    def give_up(self) -> None:
+        """Let whoever waits wait no longer; for any thread."""
+        self._given_up = True
+        with self._changed:
+            self._changed.notify_all()
 
     def close(self) -> None:
         """End the thread; the world stands still from now on."""
@@ -115,15 +123,22 @@ class LiveWorld:
         with self._changed:
             self._hurried += 1
             self._changed.notify_all()
-            while self._placed < self._hurried and self._failure is None:
-                if not self._clock.wait_until(given_ns + round(LONGEST_WAIT_S * 1e9), self._changed):
-                    break
-        self._check()
-        if self._placed < self._hurried:
+        if not self._carried_out_by(given_ns + round(LONG_WAIT_S * 1e9)):
+            logger.warning("waiting for the simulated world's first picture; it is in\n%s", self._innermost_calls())
+        if not self._carried_out_by(given_ns + round(LONGEST_WAIT_S * 1e9)):
             raise ServiceError(
                 f"the simulated world has shown no picture for {LONGEST_WAIT_S:g} s: it is too slow, or hangs, in\n"
                 f"{self._innermost_calls()}"
             )
+
+    def _carried_out_by(self, deadline_ns: int) -> bool:
+        """False if the orders in a hurry have not been carried out by then; who has given up does not want to know."""
+        with self._changed:
+            while self._placed < self._hurried and self._failure is None and not self._given_up:
+                if not self._clock.wait_until(deadline_ns, self._changed):
+                    return False
+        self._check()
+        return True
 
     def _check(self) -> None:
         if self._failure is not None:
@@ -163,7 +178,7 @@ class LiveWorld:
                 with self._changed:
                     if self._placed == self._hurried and not self._ended:
                         self._clock.wait_until(self._world.next_due_ns, self._changed)
-        except Exception as failure:
+        except (Exception, SystemExit) as failure:
             if not isinstance(failure, RelodError):  # A robot's own fault: whoever wrote it wants to know where.
                 logger.exception("the simulated world has ended")
             with self._changed:

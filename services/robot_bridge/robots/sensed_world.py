@@ -7,6 +7,7 @@ calls it, in real time a thread of its own (:mod:`services.robot_bridge.robots.l
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,14 +100,17 @@ class SensedWorld:
         """What the robot counts; for any thread."""
         return self.robot.counters()
 
-    def place(self, goal: np.ndarray, start: np.ndarray, seed: int) -> None:
-        """Place goal and robot now; all noise follows from ``seed`` from here on."""
+    def place(self, goal: np.ndarray, start: np.ndarray, seed: int, clock: Callable[[], int] | None = None) -> None:
+        """Place goal and robot now; all noise follows from ``seed`` from here on.
+
+        By a ``clock``, what placing takes has passed when the first packet and frame are taken.
+        """
         of_sensors, of_camera = np.random.default_rng(seed).spawn(2)
         self._rng = of_sensors
         self.camera.begin(of_camera)
         self.robot.place(goal, start)
         if self._now_ns is not None:
-            self._begin(self._now_ns)
+            self._begin(clock() if clock else self._now_ns)
 
     def command(self, action: np.ndarray) -> None:
         """Let the robot obey ``action`` (A,) from now on."""
@@ -174,7 +178,7 @@ class SensedWorld:
             self._now_ns = now_ns
 
     def _sense(self, now_ns: int) -> None:
-        values = self.robot.sense()
+        values = np.asarray(self.robot.sense())
         if not np.isfinite(values).all():
             raise ServiceError(f"a sensor of {type(self.robot).__name__} gave {values}: expected finite numbers")
         if self._sensor_noise.any():

@@ -119,6 +119,12 @@ class Task(ABC):
         """
         return None
 
+    def give_up(self) -> None:  # noqa: B027 - most worlds never wait
+        """Let whoever waits for the world, as for an attempt's first frame, wait no longer: the run ends.
+
+        Called by any thread; must not wait itself.
+        """
+
     def counters(self) -> dict[str, float]:
         """Counts of the task's own, for the bridge's status and the record; they may be asked for by any thread."""
         return {}

@@ -68,6 +68,11 @@ class View:
     width: int
     frame_stack: int
 
+    def __post_init__(self) -> None:
+        for name in ("height", "width", "frame_stack"):
+            if (value := getattr(self, name)) < 1:
+                raise ConfigError(f"View: {name} = {value}: expected at least 1")
+
 
 class RobotTask(Task):
     """A simulated robot; in real time it lives in a thread of its own from :meth:`start` on."""
@@ -178,7 +183,10 @@ class RobotTask(Task):
 
     def outcome(self) -> Outcome:
         assert self._newest_frame is not None, "advance_to() has not been called"
-        return self._judge(self._newest_frame.frame, self._world.newest.values)
+        outcome = self._judge(self._newest_frame.frame, self._world.newest.values)
+        if not isinstance(outcome, Outcome):
+            raise ServiceError(f"{type(self).__name__}._judge() gave {outcome!r}: expected an Outcome")
+        return outcome
 
     def newest_frame_ns(self) -> int:
         return self._world.camera.newest_capture_ns
@@ -187,6 +195,10 @@ class RobotTask(Task):
         """How many packets the sensors have sent, and frames the camera has captured: their rates, over time."""
         rates = {"sensor_packets": self._world.packets, "camera_frames": self._world.camera.frames}
         return {**rates, **self._world.counters()}
+
+    def give_up(self) -> None:
+        if isinstance(self._world, LiveWorld):
+            self._world.give_up()
 
     def close(self) -> None:
         super().close()
@@ -226,6 +238,11 @@ class RobotTask(Task):
         settings, view = self._settings, self.VIEW
         action_low, action_high = self._action_limits()
         low, high = self._proprioception_limits()
+        for what, lowest, highest in (("action", action_low, action_high), ("proprioception", low, high)):
+            if not np.all(np.asarray(lowest) < highest):
+                raise ConfigError(
+                    f"{type(self).__name__}._{what}_limits() gives {lowest}, {highest}: expected low < high"
+                )
         size = np.array([view.height, view.width], np.int64)
         return TaskSpec(
             task=name,

@@ -186,6 +186,20 @@ def test_a_pause_between_two_first_observations_is_noticed_and_counts_as_none(tm
     assert scene.bridge.details()["unanswered_first_observations"] == 6
 
 
+def test_who_is_asked_to_stop_while_the_robot_is_placed_publishes_no_start(tmp_path):
+    scene = scene_of(tmp_path, steps=5)
+    assert scene.service.on_stop == scene.task.give_up  # which lets a placement return at once
+    place = scene.task.begin_episode
+
+    def stop_meanwhile():
+        scene.service.stop("SIGINT")
+        place()
+
+    scene.task.begin_episode = stop_meanwhile
+    time_steps = scene.run()
+    assert [step.seq for step in time_steps] == [0]  # the one that asks for a first answer
+
+
 def test_probes_do_not_count_as_attempts_of_the_episode(tmp_path):
     scene = scene_of(tmp_path, {3}, steps=4)
     scene.probe_answer = None

@@ -26,7 +26,7 @@ def test_a_stall_and_its_end_are_logged_once_each(caplog):
         watch.look(frame * MS, now * MS)
     assert [(record.levelno, record.message) for record in caplog.records] == [
         (logging.WARNING, "the camera has stalled: its newest frame is 0.15 s old"),
-        (logging.WARNING, "the camera is back after 0.26 s without a frame"),
+        (logging.WARNING, "the camera is back: its newest frame is 0.01 s old"),
     ]
 
 

@@ -152,7 +152,7 @@ def drawn(monkeypatch):
         picture = np.zeros((9, 16, 3), np.uint8)
         for number in range(3):
             task.at_moment.get(number, lambda: None)()
-            yield preview.Moment(0.5 * number, frame=picture, mask=None, room=picture, at_goal=False)
+            yield preview.Moment(0.5 * number, frame=picture, mask=None, room=picture, at_goal=np.bool_(number == 2))
 
     monkeypatch.setattr(preview, "_task", lambda options: task)
     monkeypatch.setattr(preview, "moments", moments)

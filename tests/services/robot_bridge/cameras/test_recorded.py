@@ -40,6 +40,16 @@ def test_another_rate_can_be_set(tmp_path):
     assert numbers(slow) == [0, 1, 2]
 
 
+def test_a_video_that_is_cut_short_says_so(tmp_path, caplog):
+    whole = write_video(tmp_path / "video.avi", 40).read_bytes()
+    (tmp_path / "cut.avi").write_bytes(whole[: len(whole) // 2])
+    for name in ("video.avi", "cut.avi"):
+        open_camera("recorded", {"file": str(tmp_path / name)}, size=SIZE, clock=FakeClock())
+    (told,) = [record.message for record in caplog.records]
+    assert "cut.avi" in told
+    assert "of 40 pictures" in told
+
+
 def test_it_begins_anew_at_its_end(tmp_path):
     clock = FakeClock()
     camera = opened(tmp_path, clock, count=3, rate=10.0)

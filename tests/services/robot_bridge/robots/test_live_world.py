@@ -115,6 +115,65 @@ def test_a_robot_s_own_fault_is_named_and_its_place_logged(clock, caplog):
     assert "assert clock is None" in caplog.text
 
 
+def test_a_robot_that_wants_to_end_the_process_ends_the_world(clock):
+    world = toy_world()
+    live = LiveWorld(world, clock)
+
+    def leave(duration_ns):
+        raise SystemExit(3)
+
+    world.robot.advance = leave
+    sleep_until(clock, clock.now_ns() + 10 * MS)
+    with pytest.raises(ServiceError, match="has ended: SystemExit: 3"):
+        live.advance_to(clock.now_ns())
+    live.close()
+
+
+def test_a_slow_placement_is_named_and_begins_when_it_is_done(clock, caplog):
+    world = toy_world()
+    live = LiveWorld(world, clock)
+    place = world.robot.place
+
+    def place_slowly(goal, start):
+        sleep_until(clock, clock.now_ns() + 3_000 * MS)
+        place(goal, start)
+
+    world.robot.place = place_slowly
+    live.camera.take()
+    live.place(ZERO, np.array([0.7]), 1)
+    (frame,) = live.camera.take()
+    assert (frame.frame[0, 0, 0], frame.capture_ns) == (70, clock.now_ns())
+    assert live.newest.capture_ns == clock.now_ns()
+    (told,) = [record.getMessage() for record in caplog.records]
+    assert "waiting for the simulated world's first picture" in told
+    assert "place_slowly" in told
+    live.close()
+
+
+def test_whoever_waits_for_a_placement_that_hangs_may_give_up(caplog):
+    world = toy_world()
+    live = LiveWorld(world, SystemClock())
+    hanging, released = threading.Event(), threading.Event()
+
+    def hang(goal, start):
+        hanging.set()
+        released.wait(TIMEOUT_S)
+
+    world.robot.place = hang
+    waiting = threading.Thread(target=live.place, args=(ZERO, ZERO, 1))
+    waiting.start()
+    try:
+        assert hanging.wait(TIMEOUT_S)
+        live.give_up()
+        waiting.join(live_world.LONG_WAIT_S / 2)
+        assert not waiting.is_alive()
+        live.close()
+        assert "thread hangs and is left behind" in caplog.text
+    finally:
+        released.set()
+        waiting.join(TIMEOUT_S)
+
+
 def test_whoever_looks_is_told_what_has_ended_the_world(clock):
     world = toy_world()
     live = LiveWorld(world, clock)

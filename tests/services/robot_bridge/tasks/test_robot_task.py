@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.config import setting
-from common.errors import ServiceError
+from common.errors import ConfigError, ServiceError
 from experiments.simulation import SimulatedClock
 from services.robot_bridge.cameras.simulated import BUFFERED_FRAMES
 from services.robot_bridge.tasks import robot_task
@@ -216,6 +216,46 @@ def test_packets_and_frames_are_counted_over_attempts():
     after = task.counters()
     # 125 and 30 a second, and one of each at the placement.
     assert {name: after[name] - before[name] for name in after} == {"sensor_packets": 251, "camera_frames": 61}
+
+
+@pytest.mark.parametrize(
+    ("what", "given", "said"),
+    [
+        (
+            "_action_limits",
+            (np.ones(1), -np.ones(1)),
+            r"Toy._action_limits\(\) gives \[1.\], \[-1.\]: expected low < high",
+        ),
+        (
+            "_proprioception_limits",
+            (np.ones(1), np.ones(1)),
+            r"Toy._proprioception_limits\(\) gives .* expected low < high",
+        ),
+    ],
+)
+def test_limits_that_leave_nothing_between_them_are_named(monkeypatch, what, given, said):
+    monkeypatch.setattr(Toy, what, lambda self: given)
+    with pytest.raises(ConfigError, match=said):
+        build()
+
+
+@pytest.mark.parametrize("name", ["height", "width", "frame_stack"])
+def test_a_view_of_nothing_is_named(name):
+    with pytest.raises(ConfigError, match=f"View: {name} = 0: expected at least 1"):
+        View(**{"camera": "eye", "height": 2, "width": 3, "frame_stack": 3, name: 0})
+
+
+def test_what_is_no_outcome_is_named(monkeypatch):
+    monkeypatch.setattr(Toy, "_judge", lambda *_: None)
+    task = begun()
+    with pytest.raises(ServiceError, match=r"Toy._judge\(\) gave None: expected an Outcome"):
+        task.outcome()
+
+
+def test_the_sensors_may_be_a_list(monkeypatch):
+    sense = Cart.sense
+    monkeypatch.setattr(Cart, "sense", lambda cart: sense(cart).tolist())
+    assert begun().read().proprioception.shape == (1,)
 
 
 def test_closing_stops_the_robot_and_lets_go_of_the_camera():
