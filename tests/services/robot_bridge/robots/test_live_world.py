@@ -349,6 +349,7 @@ def test_a_world_that_hangs_when_an_attempt_begins_is_named(monkeypatch):
     live = LiveWorld(world, SystemClock())
     drawn = threading.Event()
     world.camera.on_capture = functools.partial(drawn.wait, TIMEOUT_S)
+    monkeypatch.setattr(live_world, "LONG_WAIT_S", 0.02)
     monkeypatch.setattr(live_world, "LONGEST_WAIT_S", 0.05)
     try:
         with pytest.raises(ServiceError, match=r"(?s)no picture for 0.05 s: .*in Sketch._picture\n.*in Event.wait"):
