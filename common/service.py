@@ -128,7 +128,10 @@ class Service:
         if not self.stopping.is_set():
             logger.info("stopping: %s", reason)
             self.stopping.set()
-            self.on_stop()
+            try:
+                self.on_stop()
+            except Exception:  # A task's own: the service has to stop all the same.
+                logger.exception("asked to stop")
         with self.wake:
             self.wake.notify_all()
 

@@ -69,10 +69,10 @@ def summarise(record: Record) -> Summary:
     if stalls := _count(parts.total(ROBOT_BRIDGE, "camera_stalls")):
         notes.append(f"the camera stalled ({stalls} x); attempts that it befell were truncated")
     lost = None if produced is None or persisted is None else produced - persisted
-    if lost and run and run.ended_early:
+    if lost and lost > 0 and run and run.ended_early:
         notes.append(f"the run was ended ({run.ended_early}): what was still on its way by then counts as lost")
     unanswered = sum(part.get("unanswered_first_observations") or 0 for part in parts.of(ROBOT_BRIDGE))
-    if lost and unanswered:
+    if lost and lost > 0 and unanswered:
         notes.append(
             f"{unanswered} first observations were not answered in time: no attempt came of them, but those that never "
             "arrived count as lost"

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from common import topics
-from common.clock import CycleKeeper
+from common.clock import CycleKeeper, Lateness
 from common.codec import encode
 from common.inbox import Arrived
 from common.messages import Action, ActionSource, Finished, Float32Array
@@ -100,7 +100,7 @@ class RobotBridge:
     # ------------------------------------------------------------------ attempts
 
     def _run_attempts(self) -> None:
-        if self._realtime:
+        if self._realtime and not self._over():
             self._task.start(self._clock)
             self._world_ns = self._clock.now_ns()
         self._task.advance_to(self._world_ns)
@@ -130,8 +130,13 @@ class RobotBridge:
             self._needs_new_goal = False
         else:
             self._task.begin_attempt()
-        if not self._service.stopping.is_set():  # Then the robot may not be where the attempt begins.
-            self._publish_first()
+        if self._service.stopping.is_set():  # The robot may not be where the attempt begins.
+            return
+        placed_ns = self._clock.now_ns()
+        if self._realtime and placed_ns >= self._keeper.deadline_ns:
+            self._count_lateness(self._keeper.next(placed_ns))
+            self._keeper.start(placed_ns)
+        self._publish_first()
 
     def _publish_first(self) -> None:
         """Publish the first TimeStep of an attempt."""
@@ -231,7 +236,10 @@ class RobotBridge:
         if not self._realtime:
             self._world_ns += self._cycle_ns
             return
-        lateness = self._keeper.next(self._clock.now_ns())
+        self._count_lateness(self._keeper.next(self._clock.now_ns()))
+
+    def _count_lateness(self, lateness: Lateness) -> None:
+        counts = self.counts
         if lateness.overrun:
             counts.overruns += 1
             counts.overruns_after_1000 += counts.cycles > WARM_UP_CYCLES

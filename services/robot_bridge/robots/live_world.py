@@ -37,10 +37,9 @@ class LiveWorld:
     """Drives a :class:`SensedWorld`, which is its thread's alone from now on, and does for others what that does."""
 
     def __init__(self, world: SensedWorld, clock: Clock) -> None:
-        """Begin to live.
-
-        Raises:
-            ServiceError: there is no picture: nothing can be drawn here.
+        """Args:
+        world: what lives, from :meth:`begin` on.
+        clock: what it lives by.
         """
         self._world, self._clock = world, clock
         self.camera = world.camera
@@ -54,6 +53,13 @@ class LiveWorld:
         self._hurried = self._placed = 0
         """Orders in a hurry, given and carried out."""
         self._thread = clock.thread(self._run, "simulated world")
+
+    def begin(self) -> None:
+        """Begin to live, and wait until there is a packet and a frame.
+
+        Raises:
+            ServiceError: there is none after :data:`LONGEST_WAIT_S`; or the world has ended: nothing can be drawn here.
+        """
         self._thread.start()
         self._carry_out_at_once(lambda: None)
 
@@ -136,9 +142,10 @@ class LiveWorld:
         with self._changed:
             while self._placed < self._hurried and self._failure is None and not self._given_up:
                 if not self._clock.wait_until(deadline_ns, self._changed):
-                    return False
+                    break
+            carried_out = self._given_up or self._placed == self._hurried
         self._check()
-        return True
+        return carried_out
 
     def _check(self) -> None:
         if self._failure is not None:
@@ -146,8 +153,10 @@ class LiveWorld:
             raise ServiceError(f"the simulated world has ended: {what}{self._failure}") from self._failure
 
     def _tell_if_behind(self, now_ns: int) -> None:
-        assert self._world.now_ns is not None, "its time began before this was built"
-        lag_ns = now_ns - self._world.now_ns - self._world.longest_rest_ns
+        world_ns = self._world.now_ns
+        if world_ns is None:  # Given up before its time began.
+            return
+        lag_ns = now_ns - world_ns - self._world.longest_rest_ns
         if self._lag_watch.look(lag_ns, now_ns):
             logger.warning(
                 "the simulated world is %.1f s behind the clock: %s, or its camera, is slower than real time, or "

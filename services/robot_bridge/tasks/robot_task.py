@@ -138,7 +138,8 @@ class RobotTask(Task):
 
     def start(self, clock: Clock) -> None:
         assert isinstance(self._world, SensedWorld), f"{self.spec.task} has been started already"
-        self._world = LiveWorld(self._world, clock)
+        self._world = live = LiveWorld(self._world, clock)
+        live.begin()
         self._forget_frames()
 
     def begin_episode(self) -> None:

@@ -186,6 +186,22 @@ def test_a_pause_between_two_first_observations_is_noticed_and_counts_as_none(tm
     assert scene.bridge.details()["unanswered_first_observations"] == 6
 
 
+def test_an_attempt_begins_when_the_robot_has_been_placed(tmp_path):
+    scene = scene_of(tmp_path, steps=3)
+    place = scene.task.begin_episode
+
+    def place_slowly():
+        scene.clock.sleep(3.0)
+        place()
+
+    scene.task.begin_episode = place_slowly
+    scene.run()
+    # The one that asks for a first answer; then whole cycles.
+    assert scene.published_s == pytest.approx([0.0, 3.0, 3.04, 3.08, 3.12])
+    assert (scene.counts.cycles, scene.counts.overruns, scene.counts.skipped_cycles) == (3, 1, 74)
+    assert scene.counts.unanswered == 0
+
+
 def test_who_is_asked_to_stop_while_the_robot_is_placed_publishes_no_start(tmp_path):
     scene = scene_of(tmp_path, steps=5)
     assert scene.service.on_stop == scene.task.give_up  # which lets a placement return at once

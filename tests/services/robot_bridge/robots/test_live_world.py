@@ -25,6 +25,12 @@ def clock():
     clock.end()
 
 
+def live_from(world, clock):
+    live = LiveWorld(world, clock)
+    live.begin()
+    return live
+
+
 def sleep_until(clock, now_ns):
     condition = clock.condition()
     with condition:
@@ -32,7 +38,7 @@ def sleep_until(clock, now_ns):
 
 
 def test_a_live_world_shows_what_the_same_world_in_lockstep_shows(clock):
-    live, lockstep = LiveWorld(toy_world(sensor_noise=0.01), clock), toy_world(sensor_noise=0.01)
+    live, lockstep = live_from(toy_world(sensor_noise=0.01), clock), toy_world(sensor_noise=0.01)
     begun_ns = clock.now_ns()
     lockstep.advance_to(begun_ns)
     worlds = live, lockstep
@@ -58,7 +64,7 @@ def test_a_live_world_shows_what_the_same_world_in_lockstep_shows(clock):
 
 def test_the_world_goes_on_while_nobody_looks(clock):
     world = toy_world()
-    live = LiveWorld(world, clock)
+    live = live_from(world, clock)
     live.command(ONE)
     sleep_until(clock, clock.now_ns() + 1_000 * MS + MS)
     assert live.newest.values[0] == pytest.approx(1.0)  # 1 m/s for 1 s
@@ -69,7 +75,7 @@ def test_the_world_goes_on_while_nobody_looks(clock):
 
 
 def test_a_placement_is_there_with_its_frame_when_it_returns(clock):
-    live = LiveWorld(toy_world(latency_ns=100 * MS), clock)
+    live = live_from(toy_world(latency_ns=100 * MS), clock)
     live.command(ONE)
     sleep_until(clock, clock.now_ns() + 500 * MS)
     before_ns = clock.now_ns()
@@ -84,7 +90,7 @@ def test_time_begins_when_the_camera_is_open(clock):
     world = toy_world()
     begun_ns = clock.now_ns()
     world.camera.on_open = lambda: sleep_until(clock, begun_ns + 700 * MS)
-    live = LiveWorld(world, clock)
+    live = live_from(world, clock)
     assert [frame.capture_ns for frame in live.camera.take()] == [begun_ns + 700 * MS]
     assert live.newest.capture_ns == begun_ns + 700 * MS
     live.close()
@@ -98,7 +104,7 @@ def test_a_world_that_cannot_draw_says_so_before_anything_begins(clock):
 
     world.camera.on_capture = fail
     with pytest.raises(ServiceError, match="the simulated world has ended: no OpenGL backend works here"):
-        LiveWorld(world, clock)
+        live_from(world, clock)
     assert world.camera.closed == 1
 
 
@@ -110,14 +116,49 @@ def test_a_robot_s_own_fault_is_named_and_its_place_logged(clock, caplog):
 
     world.camera.on_capture = fail
     with pytest.raises(ServiceError, match="the simulated world has ended: AssertionError"):
-        LiveWorld(world, clock)
+        live_from(world, clock)
     assert "test_live_world.py" in caplog.text
     assert "assert clock is None" in caplog.text
 
 
+def test_whoever_waits_for_a_camera_that_does_not_open_may_give_up(monkeypatch):
+    for wait in ("LONG_WAIT_S", "LONGEST_WAIT_S"):
+        monkeypatch.setattr(live_world, wait, 10 * TIMEOUT_S)
+    world = toy_world()
+    released = threading.Event()
+    world.camera.on_open = lambda: released.wait(TIMEOUT_S)
+    live = LiveWorld(world, SystemClock())
+    waiting = threading.Thread(target=live.begin)
+    waiting.start()
+    try:
+        live.give_up()
+        waiting.join(TIMEOUT_S)
+        assert not waiting.is_alive()
+        live.advance_to(SystemClock().now_ns())
+    finally:
+        released.set()
+        live.close()
+
+
+def test_what_is_done_at_the_last_moment_is_done(clock, monkeypatch):
+    world = toy_world()
+    live = live_from(world, clock)
+    wait_until = clock.wait_until
+
+    def time_out(deadline_ns, condition):
+        wait_until(deadline_ns, condition)
+        return False
+
+    with monkeypatch.context() as patch:
+        patch.setattr(clock, "wait_until", time_out)
+        live.place(ZERO, ONE, 1)
+    assert live.newest.values == 1.0
+    live.close()
+
+
 def test_a_robot_that_wants_to_end_the_process_ends_the_world(clock):
     world = toy_world()
-    live = LiveWorld(world, clock)
+    live = live_from(world, clock)
 
     def leave(duration_ns):
         raise SystemExit(3)
@@ -131,7 +172,7 @@ def test_a_robot_that_wants_to_end_the_process_ends_the_world(clock):
 
 def test_a_slow_placement_is_named_and_begins_when_it_is_done(clock, caplog):
     world = toy_world()
-    live = LiveWorld(world, clock)
+    live = live_from(world, clock)
     place = world.robot.place
 
     def place_slowly(goal, start):
@@ -150,9 +191,11 @@ def test_a_slow_placement_is_named_and_begins_when_it_is_done(clock, caplog):
     live.close()
 
 
-def test_whoever_waits_for_a_placement_that_hangs_may_give_up(caplog):
+def test_whoever_waits_for_a_placement_that_hangs_may_give_up(caplog, monkeypatch):
+    for wait in ("LONG_WAIT_S", "LONGEST_WAIT_S"):
+        monkeypatch.setattr(live_world, wait, 10 * TIMEOUT_S)
     world = toy_world()
-    live = LiveWorld(world, SystemClock())
+    live = live_from(world, SystemClock())
     hanging, released = threading.Event(), threading.Event()
 
     def hang(goal, start):
@@ -165,7 +208,7 @@ def test_whoever_waits_for_a_placement_that_hangs_may_give_up(caplog):
     try:
         assert hanging.wait(TIMEOUT_S)
         live.give_up()
-        waiting.join(live_world.LONG_WAIT_S / 2)
+        waiting.join(TIMEOUT_S)
         assert not waiting.is_alive()
         live.close()
         assert "thread hangs and is left behind" in caplog.text
@@ -176,7 +219,7 @@ def test_whoever_waits_for_a_placement_that_hangs_may_give_up(caplog):
 
 def test_whoever_looks_is_told_what_has_ended_the_world(clock):
     world = toy_world()
-    live = LiveWorld(world, clock)
+    live = live_from(world, clock)
     live.advance_to(clock.now_ns())
     world.robot.offset = np.nan
     sleep_until(clock, clock.now_ns() + 10 * MS)
@@ -206,7 +249,7 @@ def warnings_of(caplog):
 
 def test_a_world_too_slow_for_real_time_is_named_with_what_it_does(clock, caplog):
     world = toy_world()
-    live = LiveWorld(world, clock)
+    live = live_from(world, clock)
     slow_down(world, clock, 2)
     for _ in range(100):
         sleep_until(clock, clock.now_ns() + 40 * MS)
@@ -220,7 +263,7 @@ def test_a_world_too_slow_for_real_time_is_named_with_what_it_does(clock, caplog
 
 def test_a_world_that_keeps_up_is_not_told_of(clock, caplog):
     world = toy_world()
-    live = LiveWorld(world, clock)
+    live = live_from(world, clock)
     slow_down(world, clock, 0.9)
     for _ in range(100):
         sleep_until(clock, clock.now_ns() + 40 * MS)
@@ -232,7 +275,7 @@ def test_a_world_that_keeps_up_is_not_told_of(clock, caplog):
 @pytest.mark.parametrize("commands", [True, False])
 def test_a_world_too_slow_forgets_what_is_older_than_two_seconds(clock, commands):
     world = toy_world()
-    live = LiveWorld(world, clock)
+    live = live_from(world, clock)
     slow_down(world, clock, 2)
     lags_ns = []
     for _ in range(250):
@@ -247,7 +290,7 @@ def test_a_world_too_slow_forgets_what_is_older_than_two_seconds(clock, commands
 @pytest.mark.parametrize("commands", [True, False])
 def test_where_drawing_is_what_is_slow_pictures_are_left_out(clock, commands):
     world = toy_world()
-    live = LiveWorld(world, clock)
+    live = live_from(world, clock)
     world.camera.on_capture = lambda: sleep_until(clock, clock.now_ns() + 50 * MS)
     lags_ns = []
     for _ in range(250):
@@ -263,7 +306,7 @@ def test_where_drawing_is_what_is_slow_pictures_are_left_out(clock, commands):
 
 def test_a_placement_does_not_wait_for_what_a_slow_world_has_missed(clock):
     world = toy_world()
-    live = LiveWorld(world, clock)
+    live = live_from(world, clock)
     slow_down(world, clock, 2)
     sleep_until(clock, clock.now_ns() + 6_000 * MS)
     before_ns = clock.now_ns()
@@ -276,7 +319,7 @@ def test_a_placement_does_not_wait_for_what_a_slow_world_has_missed(clock):
 
 def test_a_world_that_is_behind_ends_at_the_next_packet(clock):
     world = toy_world()
-    live = LiveWorld(world, clock)
+    live = live_from(world, clock)
     durations_ns = slow_down(world, clock, 10)
     sleep_until(clock, clock.now_ns() + 1_000 * MS)
     live.command(ONE)
@@ -289,7 +332,7 @@ def test_a_world_that_is_behind_ends_at_the_next_packet(clock):
 
 def test_a_world_that_hangs_is_left_behind_when_it_is_closed(monkeypatch, caplog):
     world = toy_world()
-    live = LiveWorld(world, SystemClock())
+    live = live_from(world, SystemClock())
     drawing, drawn = threading.Event(), threading.Event()
 
     def draw():
@@ -313,7 +356,7 @@ def test_a_world_that_hangs_is_left_behind_when_it_is_closed(monkeypatch, caplog
 def test_a_closed_world_has_no_thread_and_stands_still():
     world = toy_world()
     before = threading.active_count()
-    live = LiveWorld(world, SystemClock())
+    live = live_from(world, SystemClock())
     assert threading.active_count() == before + 1
     live.close()
     assert threading.active_count() == before
@@ -323,7 +366,7 @@ def test_a_closed_world_has_no_thread_and_stands_still():
 def test_nothing_waits_for_a_picture_that_is_being_drawn():
     world = toy_world()
     clock = SystemClock()
-    live = LiveWorld(world, clock)
+    live = live_from(world, clock)
     drawing, drawn = threading.Event(), threading.Event()
 
     def draw():
@@ -346,7 +389,7 @@ def test_nothing_waits_for_a_picture_that_is_being_drawn():
 
 def test_a_world_that_hangs_when_an_attempt_begins_is_named(monkeypatch):
     world = toy_world()
-    live = LiveWorld(world, SystemClock())
+    live = live_from(world, SystemClock())
     drawn = threading.Event()
     world.camera.on_capture = functools.partial(drawn.wait, TIMEOUT_S)
     monkeypatch.setattr(live_world, "LONG_WAIT_S", 0.02)

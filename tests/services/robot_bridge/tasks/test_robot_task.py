@@ -1,17 +1,21 @@
 """What every simulated robot's task does with frames, orders and seeds; on a toy, without OpenGL."""
 
+import threading
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
+from common.clock import SystemClock
 from common.config import setting
 from common.errors import ConfigError, ServiceError
 from experiments.simulation import SimulatedClock
 from services.robot_bridge.cameras.simulated import BUFFERED_FRAMES
+from services.robot_bridge.robots.live_world import LONGEST_WAIT_S
 from services.robot_bridge.tasks import robot_task
 from services.robot_bridge.tasks.base import Outcome
 from services.robot_bridge.tasks.robot_task import RobotSettings, RobotTask, View
+from tests.helpers import TIMEOUT_S
 from tests.services.robot_bridge.robots.toy_world import RATES, Cart, Sketch
 
 CYCLE_NS = 40_000_000
@@ -237,6 +241,29 @@ def test_limits_that_leave_nothing_between_them_are_named(monkeypatch, what, giv
     monkeypatch.setattr(Toy, what, lambda self: given)
     with pytest.raises(ConfigError, match=said):
         build()
+
+
+def test_whoever_waits_for_the_robot_to_be_placed_may_give_up():
+    task = build(pacing="realtime")
+    task.start(SystemClock())
+    hanging, released = threading.Event(), threading.Event()
+
+    def hang(goal, start):
+        hanging.set()
+        released.wait(TIMEOUT_S)
+
+    task.cart.place = hang
+    waiting = threading.Thread(target=task.begin_attempt)
+    waiting.start()
+    try:
+        assert hanging.wait(TIMEOUT_S)
+        task.give_up()
+        waiting.join(LONGEST_WAIT_S / 2)
+        assert not waiting.is_alive()
+    finally:
+        released.set()
+        waiting.join(TIMEOUT_S)
+        task.close()
 
 
 @pytest.mark.parametrize("name", ["height", "width", "frame_stack"])
