@@ -57,7 +57,7 @@ class MjpegServer:
         self.sent_ns = {}
         """Number of a picture -> when it was sent, the computer's monotonic clock."""
         self._numbers = iter(range(1, 1 << _BITS))
-        self.damaged = lambda number: False
+        self.undecodable = lambda number: False
         """Which numbers are sent as what is no picture."""
         camera = self
 
@@ -105,7 +105,7 @@ class MjpegServer:
                 continue
             number = next(self._numbers)
             picture = cv2.imencode(".jpg", draw(number, self._size))[1].tobytes()
-            if self.damaged(number):
+            if self.undecodable(number):
                 picture = b"no picture"
             head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
             self.sent_ns[number] = time.monotonic_ns()

@@ -62,13 +62,13 @@ def test_a_stream_that_stalls_is_lost_and_comes_back_with_the_next_numbers(opene
 
 
 def test_what_cannot_be_decoded_in_a_stream_is_left_out(opened, server, caplog):
-    server.damaged = lambda number: number % 20 in (5, 6)
+    server.undecodable = lambda number: number % 20 in (5, 6)
     camera, frames = opened(url=server.url, read_timeout=10.0), []
     eventually(lambda: frames.extend(camera.take()) or len(frames) >= 60, "frame 60")
     assert (camera.losses, camera.lost) == (0, None)
     assert camera.dropped >= 4
     assert [frame.frame_id for frame in frames] == list(range(len(frames)))
-    assert not [number for frame in frames if server.damaged(number := number_of(frame.frame))]
+    assert not any(server.undecodable(number_of(frame.frame)) for frame in frames)
     told = [record.message for record in caplog.records if "cannot be decoded" in record.message]
     assert 1 <= len(told) <= 2
 

@@ -243,33 +243,27 @@ def slow_down(world, clock, factor):
     return durations_ns
 
 
-def warnings_of(caplog):
+def warnings_at(clock, caplog, factor):
+    """What is told in 4 s of a world that needs ``factor`` times as long for a time as that lasts."""
+    world = toy_world()
+    live = live_from(world, clock)
+    slow_down(world, clock, factor)
+    for _ in range(100):
+        sleep_until(clock, clock.now_ns() + 40 * MS)
+        live.advance_to(clock.now_ns())
+    live.close()
     return [record.getMessage() for record in caplog.records if "behind the clock" in record.message]
 
 
 def test_a_world_too_slow_for_real_time_is_named_with_what_it_does(clock, caplog):
-    world = toy_world()
-    live = live_from(world, clock)
-    slow_down(world, clock, 2)
-    for _ in range(100):
-        sleep_until(clock, clock.now_ns() + 40 * MS)
-        live.advance_to(clock.now_ns())
-    (warning,) = warnings_of(caplog)
+    (warning,) = warnings_at(clock, caplog, factor=2)
     assert "Cart" in warning
     assert f'File "{__file__}", line ' in warning
     assert "advance_slowly\n" in warning
-    live.close()
 
 
 def test_a_world_that_keeps_up_is_not_told_of(clock, caplog):
-    world = toy_world()
-    live = live_from(world, clock)
-    slow_down(world, clock, 0.9)
-    for _ in range(100):
-        sleep_until(clock, clock.now_ns() + 40 * MS)
-        live.advance_to(clock.now_ns())
-    assert not warnings_of(caplog)
-    live.close()
+    assert not warnings_at(clock, caplog, factor=0.9)
 
 
 @pytest.mark.parametrize("commands", [True, False])
